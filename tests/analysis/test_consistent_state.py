@@ -80,6 +80,7 @@ def test_rows_that_are_rounding_everywhere_hold_nothing(angle):
         np.testing.assert_allclose(np.diagonal(found.A[2:, :2]), [-0.5, -4.0], rtol=1e-14)
 
 
+@pytest.mark.full
 def test_a_dead_point_of_one_crank_is_no_such_place():
     """Crank and coupler in line: the other crank rests, the first moves on."""
     row = jl.Holonomic(lambda t, q, p: loop(t, q, p) - jnp.array([-0.5, 0.0]), "row")

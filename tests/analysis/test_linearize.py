@@ -134,6 +134,7 @@ def test_columns_are_differences_along_the_constraints(skate):
     np.testing.assert_allclose(linear.y0, y0, atol=1e-12)
 
 
+@pytest.mark.full
 def test_columns_of_inputs_are_exact_as_forces_are_linear_in_them(skate):
     at, linear = skate
     assert linear.inputs == ("thrust", *(f"load[{i}]" for i in range(6)))

@@ -154,6 +154,7 @@ def test_constrained_motion_in_two_sets_of_coordinates():
     assert np.max(np.abs(moved.linear.A - A)) <= 1e3 * TIGHT["rtol"]  # 2e-10, of the two motions
 
 
+@pytest.mark.full
 def test_rows_are_those_of_linearize():
     moved, _ = pendulums()
     i = 2

@@ -67,6 +67,7 @@ def test_eigenvalues_of_an_upright_rolling_disk(form):
     check_eigenvalues(rolling_upright(form, speeds, RING), disk_eigenvalues(speeds, **RING))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", FORMS)
 def test_critical_speed_of_a_thin_disk(form):
     """v^2 = g R / 3: the disk falls below it and oscillates above it.

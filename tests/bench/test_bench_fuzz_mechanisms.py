@@ -231,6 +231,7 @@ def test_unreported_contradiction_is_detected(monkeypatch):
     assert found_in(BENT) == ["arrays: a number where rows or masses are contradictory"]
 
 
+@pytest.mark.full
 def test_refused_solution_is_detected(monkeypatch):
     monkeypatch.setattr(_array_terms, "redundant_rows_hold", lambda *_: jnp.array(False))
     assert found_in(DOUBLED) == ["arrays: a is no number"]

@@ -39,6 +39,7 @@ def speeds(t, q, v, params):
 PARAMS = {"m": 2.0, "I": 0.5}
 
 
+@pytest.mark.full
 def test_every_declared_function_accepts_names():
     """Lagrangian, force with inputs, constraint and quasi-velocities, by names and flat."""
     by_name = jl.System(

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _families import mostly_full
 from _systems.quasi_systems import (
     BLADE,
     NAMES,
@@ -66,9 +65,8 @@ def swinging(t, q, v, params):
     return 0.5 * params["m"] * (1.0 + 0.1 * jnp.sin(q[1])) * (v @ v) - q[0] ** 2
 
 
-@pytest.mark.parametrize(
-    "pitch", mostly_full([0.5 * np.pi, -0.5 * np.pi, 1.5 * np.pi], 0.5 * np.pi)
-)
+@pytest.mark.full
+@pytest.mark.parametrize("pitch", [0.5 * np.pi, -0.5 * np.pi, 1.5 * np.pi])
 def test_rates_of_rounding_count_as_singular(pitch):
     """Without roll the third rate is 6e-17 yaw', which is rounding."""
     system, q, v = angles(), [0.0, pitch, 0.0], [0.1, 0.2, 0.3]
@@ -251,6 +249,7 @@ def braked(t, q, v, params, lam):
     return -0.2 * lam["b"] * v
 
 
+@pytest.mark.full
 def test_forces_may_read_multipliers_of_quasi_velocities():
     """Such systems are solved with multipliers; the quasi-velocity formulation has none."""
     force = jl.GeneralizedForce(braked, "brake", reaction=True)

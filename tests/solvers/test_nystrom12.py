@@ -285,6 +285,7 @@ def test_a_smooth_wall_is_not_missed():
     assert np.max(np.abs(found / (9.81 * h + np.exp(-h / w)) - 1)) < 1e-5
 
 
+@pytest.mark.full
 def test_derivatives_are_those_of_the_motion():
     """Forward, reverse and second ones beside central differences, in a recorded motion."""
 

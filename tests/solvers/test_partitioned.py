@@ -364,6 +364,7 @@ points = jl.System(
 )
 
 
+@pytest.mark.full
 def test_iterations_at_the_level_of_rounding_converge():
     """x2 and y2' are small here: this step failed, and 1 in 3000 of those within 1e-15 of it.
 

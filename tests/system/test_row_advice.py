@@ -66,6 +66,7 @@ def test_dead_points_are_singular_and_redundant_rows_are_not():
 ADVICE = r"'rod' vanishes wherever the row holds, as for y\*\*2.* Write the quantity itself, y"
 
 
+@pytest.mark.full
 def test_all_errors_advise_on_vanishing_rows():
     row, q = VANISHING["square"]
     given = system(row)

@@ -107,6 +107,7 @@ def test_derivatives_across_nonsmooth_points_by_other_methods(ball, method):
     np.testing.assert_allclose(slopes, exact, rtol=1e-3 if method == "kvaerno5" else 1e-4)
 
 
+@pytest.mark.full
 def test_motions_without_nonsmooth_points_have_the_same_steps():
     """A norm contains a comparison; a distant switch never changes its outcome."""
 
