@@ -1,6 +1,6 @@
 """A program as a flat list of operations, with calls replaced by what they call."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +8,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jaxlag._core._arrays import concrete
 from jaxlag._core._jaxprs import called
+from jaxlag._tracing._interpret import held
 
 BARRIER = "optimization_barrier"
 
@@ -122,13 +124,13 @@ def ids(values: Iterable[Value]) -> set[int]:
     return {value for value in values if isinstance(value, int)}
 
 
-def traced_consts(program: ClosedJaxpr) -> list[Any]:
-    """The constants of a program without known values."""
-    return [x for x in program.consts if isinstance(x, Tracer)]
+def flat(function: Callable, *args: Any) -> tuple[FlatProgram, list[Any]]:
+    """The flat program of a function, and its traced constants."""
+    program = jax.make_jaxpr(function)(*args)
+    return _flat_program(program), [x for x in program.consts if isinstance(x, Tracer)]
 
 
-def flat_program(program: ClosedJaxpr) -> FlatProgram:
-    """The flat form of a program."""
+def _flat_program(program: ClosedJaxpr) -> FlatProgram:
     avals: list[Any] = []
     operations: list[Operation] = []
 
@@ -149,32 +151,22 @@ def flat_program(program: ClosedJaxpr) -> FlatProgram:
 
         for eqn in jaxpr.eqns:
             operands = tuple(map(read, eqn.invars))
-            inner = called(eqn)
-            if inner is not None:
-                values |= dict(
-                    zip(eqn.outvars, add(inner, known_consts(inner), operands), strict=True)
-                )
+            inner, results = called(eqn), list[Value]()
+            if inner is not None and concrete(inner.consts):
+                results = add(inner, list(map(held, inner.consts)), operands)
             else:
-                results = tuple(map(new, eqn.outvars))
-                operations.append(Operation(eqn.primitive, eqn.params, operands, results))
-                values |= dict(zip(eqn.outvars, results, strict=True))
+                made = tuple(map(new, eqn.outvars))
+                operations.append(Operation(eqn.primitive, eqn.params, operands, made))
+                results += made
+            values |= dict(zip(eqn.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
-
-    def known_consts(code: ClosedJaxpr) -> list[Value]:
-        return [np.asarray(x) for x in code.consts]
 
     jaxpr = program.jaxpr
     consts: list[Value] = [
-        new(var) if isinstance(x, Tracer) else np.asarray(x)
+        new(var) if isinstance(x, Tracer) else held(x)
         for var, x in zip(jaxpr.constvars, program.consts, strict=True)
     ]
     inputs = list(map(new, jaxpr.invars))
     outputs = add(program, consts, inputs)
     traced = tuple(x for x in consts if isinstance(x, int))
     return FlatProgram(operations, traced, tuple(inputs), tuple(outputs), avals)
-
-
-def flat(function: Any, *args: Any) -> tuple[FlatProgram, list[Any]]:
-    """The flat program of a function, and its traced constants."""
-    program = jax.make_jaxpr(function)(*args)
-    return flat_program(program), traced_consts(program)

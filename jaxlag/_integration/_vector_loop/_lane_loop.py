@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
@@ -126,7 +125,6 @@ class _Loop(NamedTuple):
         count: number of trajectories.
         turn: the body in parts.
         moving: next values of the numbers that change and are needed.
-        elements: the numbers of each source of the turn's program.
     """
 
     programs: Sequence[FlatProgram]
@@ -135,7 +133,6 @@ class _Loop(NamedTuple):
     count: int
     turn: Turn
     moving: dict[int, Value]
-    elements: dict[int, list[int]]
 
     @classmethod
     def of(cls, programs: Any, consts: Any, start: list[_Batch], count: int) -> "_Loop":
@@ -146,9 +143,7 @@ class _Loop(NamedTuple):
             read = program.read_by(program.operations, program.outputs)
             pairs = zip(body.inputs, program.inputs, strict=True)
             wanted |= {x for x, same in pairs if same in read}
-        numbers = split(body, turn.sources, turn.numbers.inputs)
-        elements = dict(zip(turn.sources, numbers, strict=True))
-        return cls(programs, consts, start, count, turn, changing(turn, wanted), elements)
+        return cls(programs, consts, start, count, turn, changing(turn, wanted))
 
     @property
     def size(self) -> int:
@@ -208,13 +203,13 @@ class _Loop(NamedTuple):
         values = *body.consts, *body.inputs
         known = dict(zip(values, (*consts, *lanes.state), strict=True))
         fixed: dict[int, Array] = {}
-        for source in self.elements.keys() & known.keys():
-            fixed |= dict(zip(self.elements[source], _rows(known[source]), strict=True))
+        for source in self.turn.elements.keys() & known.keys():
+            fixed |= dict(zip(self.turn.elements[source], _rows(known[source]), strict=True))
 
         def state(carry: _Carry) -> list[Array]:
             rows, buffers = fixed | carry[0], carry[1]
             arrays = {
-                x: _array([rows[number] for number in self.elements[x]], known[x])
+                x: _array([rows[number] for number in self.turn.elements[x]], known[x])
                 for x in body.inputs
                 if x not in buffers
             }
@@ -229,7 +224,7 @@ class _Loop(NamedTuple):
             if self.turn.found:
                 found = self.vmapped(1, self.before, lanes.consts, state(carry))
             for x, array in zip(self.turn.found, found, strict=True):
-                rows |= dict(zip(self.elements[x], _rows(array), strict=True))
+                rows |= dict(zip(self.turn.elements[x], _rows(array), strict=True))
             return self.next(rows, carry[1])
 
         carry = {x: fixed[x] for x in self.moving}, {x: known[x] for x in self.turn.writes}
@@ -238,11 +233,10 @@ class _Loop(NamedTuple):
     def next(self, rows: dict[int, Array], buffers: dict[int, Array]) -> _Carry:
         """One turn, after the operations that come before."""
         turn, buffers = self.turn, dict(buffers)
-        written = [x for operation in turn.writes.values() for x in operation.operands[1:]]
-        count = sum(int(np.prod(turn.body.aval(x).shape)) for x in written)
+        kinds = [turn.body.aval(x) for x in turn.written]
+        count = sum(x.size for x in kinds)
         new = self.on_rows([*self.moving.values(), *turn.numbers.last(count)], rows)
-        entries = split(turn.body, written, new[len(self.moving) :])
-        kinds = [turn.body.aval(x) for x in written]
+        entries = split(turn.body, turn.written, new[len(self.moving) :])
         shapes = [jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype) for x in kinds]
         given = list(map(_array, entries, shapes))
         for buffer, operation in turn.writes.items():

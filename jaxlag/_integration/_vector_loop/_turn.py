@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from jaxlag._integration._vector_loop._divisions import with_fewer_divisions
 from jaxlag._integration._vector_loop._flat_program import FlatProgram, Operation, Value
 from jaxlag._integration._vector_loop._on_numbers import is_supported, on_numbers
@@ -27,18 +25,19 @@ class Turn(NamedTuple):
         before: operations on arrays, which come first.
         found: their results that the numbers depend on.
         writes: the operation that writes into a buffer, by the number of its input; last.
-        sources: values of the body whose elements are the inputs of `numbers`.
-        numbers: the rest, on numbers; its outputs are the elements of `targets`.
-        targets: the next state apart from buffers, and what is written into them.
+        written: what the writes read apart from their buffers.
+        numbers: the rest, on numbers. Its outputs are the elements of the next state apart from
+            buffers, and those of `written`.
+        elements: the inputs of `numbers` that are the elements of a value of the body.
     """
 
     body: FlatProgram
     before: list[Operation]
     found: list[int]
     writes: dict[int, Operation]
-    sources: list[int]
+    written: list[Value]
     numbers: FlatProgram
-    targets: list[Value]
+    elements: dict[int, list[int]]
 
 
 def turn_of(body: FlatProgram) -> Turn:
@@ -60,15 +59,15 @@ def turn_of(body: FlatProgram) -> Turn:
         names = ", ".join(sorted({operation.name for operation in beyond}))
         raise NotVectorizable(f"{names} on computed numbers")
     following = zip(body.inputs, body.outputs, strict=True)
-    targets: list[Value] = [after for start, after in following if start not in writes]
-    for operation in writes.values():
-        targets += operation.operands[1:]
+    written = [x for operation in writes.values() for x in operation.operands[1:]]
+    targets = [*(after for start, after in following if start not in writes), *written]
     read = body.read_by(body.needed(targets, known), targets)
     found = sorted(read.intersection(known))
     consts = [x for x in body.consts if x in read]  # not tables, which are read before the turn
     sources = [*consts, *(x for x in body.inputs if x not in writes), *found]
     numbers = with_fewer_divisions(on_numbers(body, sources, targets))
-    return Turn(body, before, found, writes, sources, numbers, targets)
+    elements = dict(zip(sources, split(body, sources, numbers.inputs), strict=True))
+    return Turn(body, before, found, writes, written, numbers, elements)
 
 
 def _writes(body: FlatProgram) -> dict[int, Operation]:
@@ -95,9 +94,8 @@ def changing(turn: Turn, wanted: Collection[int]) -> dict[int, Value]:
         turn: the turn.
         wanted: parts of the state that must be known on every turn.
     """
-    numbers, body = turn.numbers, turn.body
-    elements = dict(zip(turn.sources, split(turn.body, turn.sources, numbers.inputs), strict=True))
-    states = [x for x in body.inputs if x not in turn.writes]
+    numbers, elements = turn.numbers, turn.elements
+    states = [x for x in turn.body.inputs if x not in turn.writes]
     start = [number for x in states for number in elements[x]]
     following = dict(zip(start, numbers.outputs, strict=False))
     written = numbers.outputs[len(start) :]
@@ -116,7 +114,7 @@ def split(body: FlatProgram, values: Sequence[Value], row: Sequence[Any]) -> lis
     """A row of all elements of several values, divided among them."""
     rest, parts = list(row), []
     for value in values:
-        size = int(np.prod(body.aval(value).shape))
+        size = body.aval(value).size
         parts.append(rest[:size])
         rest = rest[size:]
     assert not rest
