@@ -1,4 +1,4 @@
-"""Derivatives of one solve and of 16: their cost relative to the solve, and their errors.
+"""Derivatives of one solve, of 16 and of 1,024: their cost relative to the solve, and their errors.
 
 The loss is |y(10)|^2 of the double pendulum. Inputs are the start (2 angles, 2 rates) and four
 parameters (2 masses, 2 lengths). `ratio` is the time divided by that of the plain solve with the
@@ -24,6 +24,7 @@ from bench._problems import mechanisms, scenes
 from systems import rigid_aircraft
 
 LANES = 16
+MANY = 1024  # in the lanes of a vectorized loop
 INPUTS = ("m1", "m2", "h1", "h2")
 PENDULUM = "double pendulum"
 SOLVE, REVERSE, FORWARD, HESSIAN = "solve", "grad", "jacfwd, 8 inputs", "hessian, 8 x 8"
@@ -70,6 +71,9 @@ def _cases(quick: bool) -> list[Case]:
     ]
     if quick:
         return cases
+    many = _inputs(MANY)
+    cases.append(Case(SOLVE, MANY, jax.vmap(end, (0, None)), many))
+    cases.append(Case(REVERSE, MANY, jax.vmap(jax.grad(loss), (0, None)), many))
     cases.append(Case(HESSIAN, 1, jax.hessian(loss), one))
     cases.append(Case(SLOPE, 1, jax.jacfwd(end), one))
     for steps in MAX_STEPS:
@@ -195,7 +199,10 @@ def _judged(
     more = []
     if (PENDULUM, HESSIAN, 1, pendulum.MAX_STEPS) in rows:
         hessian = of(rows, HESSIAN)
+        many = of(rows, REVERSE, MANY)
         targets += [
+            Target(f"us for a gradient, {MANY} at once", 1e3 * many["min_ms"] / MANY, "<=", 150.0),
+            Target(f"times the solve, {MANY} lanes: gradient", many["ratio"], "<=", 4.0),
             Target("error of the hessian", hessian["error"], "<=", 1e-6),
             Target("times the solve: hessian, 8 x 8", hessian["ratio"], "<=", 25.0),
             Target("s to compile a hessian", hessian["trace_s"] + hessian["compile_s"], "<=", 10.0),

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from jaxlag._core._custom_jvp import CustomJVP
 
@@ -45,7 +45,8 @@ def is_faster_vectorized(count: Any, max_steps: int) -> bool:
         count: number of trajectories, which may be a symbol of `jax.export`.
         max_steps: bound on the steps of each.
     """
-    return at_most(VECTORIZED_FROM, count) and at_most(TURNS, count * max_steps)
+    is_known = isinstance(count, int)  # a program for any number of them cannot be exported
+    return is_known and count >= VECTORIZED_FROM and count * max_steps >= TURNS
 
 
 class Chunks(NamedTuple):
@@ -128,7 +129,12 @@ def _batch(chunks: Callable[[Any], Chunks], size: Any) -> Callable:
 
 
 def in_batches(
-    function: Callable, lanes: PyTree, count: Any, at_once: Any, even: bool = True
+    function: Callable,
+    lanes: PyTree,
+    count: Any,
+    at_once: Any,
+    even: bool = True,
+    order: Array | None = None,
 ) -> PyTree:
     """The vmapped function over `count` lanes, up to `at_once` at a time.
 
@@ -139,15 +145,25 @@ def in_batches(
         at_once: the largest batch.
         even: whether batches may be smaller to be equal; otherwise, and if their number is a symbol
             of `jax.export`, all have `at_once` lanes. The last lane fills up the last batch.
+        order: of the lanes in the batches; None for their own.
     """
     if at_most(count, at_once):
         return jax.vmap(function)(lanes)
     batches = -(-count // at_once)
     size = -(-count // batches) if even and isinstance(count, int) else at_once
     filled = jnp.minimum(jnp.arange(batches * size), count - 1)
-    parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), lanes)
-    results = lax.map(jax.vmap(function), parts)
-    return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
+    if order is not None:
+        filled = order[filled]
+
+    def batch(of: Array) -> PyTree:
+        return jax.vmap(function)(jax.tree.map(lambda x: x[of], lanes))
+
+    results = lax.map(batch, filled.reshape(batches, size))
+    results = jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
+    if order is None:
+        return results
+    places = jnp.argsort(order)
+    return jax.tree.map(lambda x: x[places], results)
 
 
 def at_most(count: Any, most: Any) -> bool:

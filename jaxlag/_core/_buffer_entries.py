@@ -1,9 +1,9 @@
-"""Buffer writes at an index of each trajectory's own, without a scatter.
+"""Buffer reads and writes at an index of each trajectory's own, without a gather or scatter.
 
 `jax.vmap` turns such a write into a scatter, and on CPU a loop with a scatter is no native
 function. A few trajectories write one after the other instead. (256 double
 pendulums, microseconds each: with 11 entries 214 | 50, 101 entries 307 | 72, 1001 entries 1262 |
-296.)
+296.) They also read one after the other: a gather of 32 entries takes ten times as long.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,70 @@ from jaxlag._core._custom_jvp import CustomJVP
 def set_entry(buffer: PyTree, index: Array, entry: PyTree) -> PyTree:
     """buffer[index] = entry in every leaf. It has no transpose."""
     return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, entry)
+
+
+def entry_of(buffer: PyTree, index: Array) -> PyTree:
+    """buffer[index] of every leaf, for an index from 0. It has no transpose."""
+    return jax.tree.map(lambda b: _get(b, index), buffer)
+
+
+def set_entries(
+    buffers: Array, rows: Array, indices: Array, entries: Array, active: Array
+) -> Array:
+    """buffers[rows[k], indices[k]] = entries[k] where active[k], one after another."""
+    rest = buffers.shape[2:]
+
+    def write(k: Array, buffers: Array) -> Array:
+        start = [rows[k], indices[k], *[0] * len(rest)]
+        start = [jnp.asarray(i, jnp.int32) for i in start]
+        present = lax.dynamic_slice(buffers, start, (1, 1, *rest))
+        new = jnp.where(active[k], entries[k].reshape(present.shape), present)
+        return lax.dynamic_update_slice(buffers, new, start)
+
+    return lax.fori_loop(0, rows.shape[0], write, buffers)
+
+
+def is_set_entry(params: Any) -> bool:
+    """Whether an operation with these parameters is `set_entry` of an array."""
+    return getattr(params.get("rule"), "__wrapped__", None) is _place.vmap_rule
+
+
+@CustomJVP
+def _get(buffer: Array, index: Array) -> Array:
+    return _taken(buffer, index)
+
+
+@_get.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple:
+    (_, index), (buffer_dot, _) = primals, tangents
+    result = _get(*primals)
+    inexact = jnp.issubdtype(result.dtype, jnp.inexact)
+    return result, _get(buffer_dot, index) if inexact else None
+
+
+@custom_vmap
+def _taken(buffer: Array, index: Array) -> Array:
+    return lax.dynamic_index_in_dim(buffer, index, keepdims=False)
+
+
+@_taken.def_vmap
+def _(size: Any, mapped: list, buffer: Array, index: Array) -> tuple[Array, bool]:
+    if not mapped[1]:
+        return lax.dynamic_index_in_dim(buffer, index, 1, keepdims=False), True
+    if not at_most(size, 2 * LANES) or jax.default_backend() != "cpu":
+        take = jax.vmap(_taken.fun, in_axes=(0 if mapped[0] else None, 0))
+        return take(buffer, index), True
+
+    def read(k: Array, entries: Array) -> Array:
+        own = (k, index[k]) if mapped[0] else (index[k],)
+        ends = buffer.shape[len(own) :]
+        start = [*own, *[0] * len(ends)]
+        start = [jnp.asarray(i, jnp.int32) for i in start]
+        entry = lax.dynamic_slice(buffer, start, [*[1] * len(own), *ends])
+        return lax.dynamic_update_index_in_dim(entries, entry.reshape(ends), k, 0)
+
+    entry = buffer.shape[2:] if mapped[0] else buffer.shape[1:]
+    return lax.fori_loop(0, size, read, jnp.zeros((size, *entry), buffer.dtype)), True
 
 
 @CustomJVP

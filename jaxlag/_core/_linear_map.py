@@ -6,14 +6,14 @@ A(r)^T y are given as programs, neither problem occurs.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
@@ -41,7 +41,12 @@ class LinearMap:
         plain_backward: A(r)^T y in the same way; None for the transpose of `plain`.
         in_lanes: the same map in the form to be vmapped over r; None for this one.
         of_columns: the same map in the form to be vmapped over several x alone; None for this one.
+        many: the same map in the form to be vmapped over many r; None for `in_lanes`. It is not
+            used if x has been vmapped before.
+        differentiated: the same map for derivatives of A(r); None for this one. It and `shapes`
+            are found, not given.
         at_once: lanes of a vmap in one batch; None for all.
+        shapes: of the leaves of A(r) x; None if they are found by tracing `forward`.
     """
 
     forward: Callable[[PyTree, PyTree], PyTree]
@@ -50,7 +55,24 @@ class LinearMap:
     plain_backward: Callable[[PyTree, PyTree], PyTree] | None = None
     in_lanes: "LinearMap | None" = None
     of_columns: "LinearMap | None" = None
+    many: "Many | None" = None
+    differentiated: "LinearMap | None" = None
     at_once: int | None = LANES
+    shapes: "list[ShapedArray] | None" = None
+
+
+class Many(NamedTuple):
+    """A linear map in the form to be vmapped over many r.
+
+    Attributes:
+        form: the map. Nobody takes derivatives of A(r) in this form.
+        suits: number of lanes -> whether they are so many.
+        work: r -> time that it takes. Lanes of similar times run together.
+    """
+
+    form: LinearMap
+    suits: Callable[[Any], bool]
+    work: Callable[[PyTree], Any]
 
 
 def linear(form: LinearMap, r: PyTree, x: PyTree) -> PyTree:
@@ -85,8 +107,16 @@ def _flat(form: LinearMap, r_tree: Any, x_tree: Any, y_tree: Any) -> LinearMap:
         between(form.plain_backward, y_tree),
         None if form.in_lanes is None else _flat(form.in_lanes, r_tree, x_tree, y_tree),
         None if form.of_columns is None else _flat(form.of_columns, r_tree, x_tree, y_tree),
-        form.at_once,
+        None if form.many is None else _flat_many(form.many, r_tree, x_tree, y_tree),
+        at_once=form.at_once,
     )
+
+
+def _flat_many(many: Many, r_tree: Any, *trees: Any) -> Many:
+    def work(r: Leaves) -> Any:
+        return many.work(jax.tree.unflatten(r_tree, r))
+
+    return many._replace(form=_flat(many.form, r_tree, *trees), work=work)
 
 
 def _transposed(form: LinearMap, like: Leaves) -> LinearMap:
@@ -103,7 +133,10 @@ def _transposed(form: LinearMap, like: Leaves) -> LinearMap:
         form.plain,
         None if form.in_lanes is None else _transposed(form.in_lanes, like),
         None if form.of_columns is None else _transposed(form.of_columns, like),
+        None if (many := form.many) is None else many._replace(form=_transposed(many.form, like)),
+        None if form.differentiated is None else _transposed(form.differentiated, like),
         form.at_once,
+        [ShapedArray(x.shape, x.dtype) for x in like],
     )
 
 
@@ -152,8 +185,14 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
     )
 
 
-def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
+def _batched(
+    form: LinearMap, size: Any, mapped: tuple[bool, ...], work: Callable | None = None
+) -> LinearMap:
     """The map for `size` lanes of x, y and the mapped leaves of r."""
+    if any(mapped) and form.many is not None and form.many.suits(size):
+        other = _batched(replace(form, many=None), size, mapped)
+        many = _batched(form.many.form, size, mapped, form.many.work)
+        return replace(many, differentiated=other)
     in_lanes = form.in_lanes
     if any(mapped) and in_lanes is not None:
         form, in_lanes = in_lanes, None
@@ -167,24 +206,32 @@ def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
         def of(r: Leaves, x: Leaves) -> list:
             own = [leaf for leaf, is_mapped in zip(r, mapped, strict=True) if is_mapped]
 
-            def one(lane: tuple) -> list:
-                mine = iter(lane[0])
-                pairs = zip(r, mapped, strict=True)
-                merged = [next(mine) if is_mapped else leaf for leaf, is_mapped in pairs]
-                return list(function(merged, lane[1]))
+            def merged(own: Leaves) -> list:
+                mine, pairs = iter(own), zip(r, mapped, strict=True)
+                return [next(mine) if is_mapped else leaf for leaf, is_mapped in pairs]
 
-            return in_batches(one, (own, list(x)), size, at_once, even=not any(mapped))
+            def one(lane: tuple) -> list:
+                return list(function(merged(lane[0]), lane[1]))
+
+            def order_by(work: Callable) -> Any:
+                return jnp.argsort(jax.vmap(lambda own: work(merged(own)))(own))
+
+            order = None if work is None else order_by(work)
+            even = not any(mapped)
+            return in_batches(one, (own, list(x)), size, at_once, even, order)
 
         return of
 
-    at_once = form.at_once or size
+    at_once, other, shapes = form.at_once or size, form.differentiated, form.shapes
     return LinearMap(
         lanes(form.forward, at_once),
         lanes(form.backward, at_once),
         lanes(form.plain, size),
         lanes(form.plain_backward, size),
         None if in_lanes is None else _batched(in_lanes, size, mapped),
+        differentiated=None if other is None else _batched(other, size, mapped),
         at_once=form.at_once,
+        shapes=None if shapes is None else [ShapedArray((size, *x.shape), x.dtype) for x in shapes],
     )
 
 
@@ -203,9 +250,20 @@ def _evaluate(*args: Any, form: LinearMap, count: int) -> list:
 
 @_linear_map.def_abstract_eval
 def _shapes(*args: Any, form: LinearMap, count: int) -> list:
+    if form.shapes is not None:
+        return form.shapes
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
     results = jax.eval_shape(form.forward, like[:count], like[count:])
     return [ShapedArray(x.shape, x.dtype) for x in results]
+
+
+def program_of(eqn: Any) -> ClosedJaxpr | None:
+    """The program A(r) x of an equation; None if it is no application of a linear map."""
+    if eqn.primitive is not _linear_map:
+        return None
+    kinds = (x.aval for x in eqn.invars)
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in kinds]
+    return jax.make_jaxpr(partial(_lowered, **eqn.params))(*like)
 
 
 def _lowered(*args: Any, form: LinearMap, count: int) -> list:
@@ -223,7 +281,7 @@ def _jvp(primals: Leaves, tangents: Leaves, *, form: LinearMap, count: int) -> t
     dots = [ad.instantiate_zeros(dot) for dot in tangents[count:]] if both else []
     if not moving:
         return results, _bind(form, r, dots)
-    derived = _derived(form, count, moving, both)
+    derived = _derived(form.differentiated or form, count, moving, both)
     return results, _bind(derived, [*r, *x], [*(tangents[i] for i in moving), *dots])
 
 

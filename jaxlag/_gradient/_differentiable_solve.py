@@ -151,7 +151,7 @@ def _integrated(problem: SplitProblem, record: bool) -> Outcome:
             return in_lanes(single, lambda _: chunks, *traced)
 
     large = Chunks(vectorized, _batching.VECTORIZED, even=True)
-    suits = not record and may_vectorize(stepper)
+    suits = may_vectorize(stepper)
 
     def divided(count: Any) -> Chunks:
         return (

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag._core import _xla
+from jaxlag._core._buffer_entries import entry_of
 from jaxlag._integration._record import Record, Times, reached_time
 
 
@@ -108,6 +109,9 @@ class RecordedMotion(NamedTuple):
         plain: whether XLA may compile a sweep to one native function. False if lanes gather at
             different indices: XLA overestimates the cost of such a gather, and splits it over
             threads.
+        lockstep: whether all lanes of a vmap go back over steps of the same index at once, which
+            are read faster, or each over its own, which need not wait for others' save times.
+        evaluate: (function, *args) -> function(*args), for a function of the arrays of a step.
     """
 
     step: Callable
@@ -119,6 +123,8 @@ class RecordedMotion(NamedTuple):
     clock: StepTimes
     stages: int
     plain: bool
+    lockstep: bool
+    evaluate: Callable
 
     def native(self, loop: Callable, *args: Any) -> Any:
         """loop(*args), compiled to one native function if possible."""
@@ -152,8 +158,13 @@ class RecordedMotion(NamedTuple):
         """The state after step k, with unchanged arguments."""
         t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
         reach = self.clock.reach(end, anchors)
-        args = self.with_args(self.moved())
-        return self.ahead(args, t, end, self.clock.jump(k), state, reach, end)
+        with_moved, moved, _ = self.local(t)
+        jump = self.clock.jump(k)
+
+        def step(state: PyTree, moved: list[Array], t: Array, end: Array) -> PyTree:
+            return self.ahead(with_moved(moved), t, end, jump, state, reach, end)
+
+        return self.evaluate(step, state, moved, t, end)
 
     def moved(self) -> list[Array]:
         """The leaves of the arguments that may vary."""
@@ -174,8 +185,7 @@ class RecordedMotion(NamedTuple):
 
 def at(buffer: PyTree, k: Array) -> PyTree:
     """Entry k of a buffer; the first one for negative k."""
-    index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
-    return jax.tree.map(index, buffer)
+    return entry_of(buffer, jnp.maximum(k, 0))
 
 
 def pick(use: Array, new: PyTree, old: PyTree) -> PyTree:

@@ -85,7 +85,7 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
             use, save = use & ~to_save, left & (~use | to_save)
             i, before = jnp.where(save, j, k), pick(save, base, before)
             t, step_end = clock.time(i - 1, anchors), clock.time(i, anchors)
-            end = jnp.where(save, dues[r], step_end)
+            end = jnp.where(save, at(dues, r), step_end)
         reach = clock.reach(step_end, anchors, *(() if saved is None else (save, r)))
         jump, end_dot = clock.jump(i), None
         if change.anchors is not None:
@@ -145,6 +145,7 @@ def adjoint_sweep(
     assert record.points is not None
     between = None if record.save_step is None else jax.tree.map(lambda x: x[1:], wanted.saved)
     moves = change.anchors is not None
+    any_lane = eqxi.unvmap_any if path.lockstep else lambda x: x
     zero = jnp.zeros((), jnp.int32)
     reached = arrived(path, anchors)
     end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.saved)
@@ -170,7 +171,7 @@ def adjoint_sweep(
         k, r, bar, pending, (args_bar, anchors_bar, dues_bar) = carry
         j, now = save_left(r), clock.time(k - 1, anchors)
         here = j == k
-        to_save = eqxi.unvmap_any(here)
+        to_save = any_lane(here)
         k = jnp.where(to_save, k, k - 1)
         t, step_end = clock.time(k - 1, anchors), clock.time(k, anchors)
         use, save, i, given = (k < record.steps) & (step_end > t) & ~to_save, here, k, bar
@@ -179,7 +180,7 @@ def adjoint_sweep(
             save = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
             i = jnp.where(save, j, k)
             t, step_end = clock.time(i - 1, anchors), clock.time(i, anchors)
-            end = jnp.where(save, dues[r - 1], end)
+            end = jnp.where(save, at(dues, r - 1), end)
             reached = clock.reach(step_end, anchors, save, r - 1)
             given = pick(save, at(between, r - 1), bar)
         y, jump, takes = state_before(i), clock.jump(i), use | save
@@ -188,13 +189,13 @@ def adjoint_sweep(
             step = lambda y, moved: path.ahead(  # noqa: E731
                 with_moved(moved), t, end, jump, y, reached, step_end
             )
-            before, more = jax.vjp(step, y, moved)[1](given)
+            before, more = path.evaluate(_transposed(step), given, y, moved)
         else:
             step = lambda y, moved, t, end, *step_end: path.ahead(  # noqa: E731
                 with_moved(moved), t, end, jump, y, reached, *step_end
             )
             times = (t, end) if reached is None else (t, end, step_end)
-            before, more, *times_bar = jax.vjp(step, y, moved, *times)[1](given)
+            before, more, *times_bar = path.evaluate(_transposed(step), given, y, moved, *times)
             t_bar, end_bar, *step_end_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
             at_save = jnp.where(save, end_bar, 0.0)
             anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
@@ -223,7 +224,7 @@ def adjoint_sweep(
 
         def left(carry: tuple) -> Array:
             k, r, *_ = carry
-            return (k > first) | eqxi.unvmap_any(save_left(r) == k)
+            return (k > first) | any_lane(save_left(r) == k)
 
         return jax.lax.while_loop(left, partial(body_fun, first, state_before), carry)
 
@@ -263,7 +264,7 @@ def adjoint_sweep(
             return back(zero, partial(at, record.points), carry)
         return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
 
-    most = eqxi.unvmap_max(record.steps)  # common to all lanes
+    most = eqxi.unvmap_max(record.steps) if path.lockstep else record.steps
     saves_left = zero
     if record.save_step is not None:
         saves_left = jnp.sum(record.save_step < record.steps, dtype=jnp.int32)
@@ -277,6 +278,11 @@ def adjoint_sweep(
         ends = jnp.zeros_like(clock.times.saves[:1])
         saves_bar = jnp.concatenate([ends, dues_bar[:-1], ends])
     return InputTangents(None if change.y0 is None else bar[0], args_bar, anchors_bar, saves_bar)
+
+
+def _transposed(step: Callable) -> Callable:
+    """(cotangent of the result, *args) -> cotangents of the arguments."""
+    return lambda bar, *args: jax.vjp(step, *args)[1](bar)
 
 
 def _added(bar: Array, more: Array, start: Array | None) -> Array:

@@ -1,6 +1,7 @@
 """The derivative of the intermediate states of a solve, as one linear map."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._core._batching import LANES, in_batches
-from jaxlag._core._linear_map import LinearMap, linear
+from jaxlag._core._batching import LANES, in_batches, is_faster_vectorized
+from jaxlag._core._linear_map import LinearMap, Many, linear
 from jaxlag._gradient._recorded_motion import (
     InputTangents,
     RecordedMotion,
@@ -24,6 +25,7 @@ from jaxlag._gradient._tangent_and_adjoint import adjoint_sweep, tangent_sweep
 from jaxlag._integration._record import Outcome, Record, Times
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers, with_stages
+from jaxlag._integration._vector_loop import WIDTH, NotVectorizable, lane_call, may_vectorize
 
 
 def changes(tangents: Any, outcome: Outcome) -> Any:
@@ -57,7 +59,9 @@ def changed(
         whole = filled(times_dot, times)
         anchors_dot, saves_dot = jax.jvp(Times.anchors, (times,), (whole,))[1], whole.saves
     x = InputTangents(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
-    kind = _Kind(problem.static, moving, y0_dot is not None, anchors_dot is not None, points)
+    vectorizes = problem.static.capacity > 0 and may_vectorize(problem.stepper)
+    parts = y0_dot is not None, anchors_dot is not None, points
+    kind = _Kind(problem.static, moving, *parts, vectorizes)
     return linear(_map(kind), (*problem.traced, record), x)
 
 
@@ -69,17 +73,23 @@ class _Kind(NamedTuple):
     start: bool
     times: bool
     points: bool
+    vectorizes: bool
 
 
-def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
-    """The variational equations as a linear map."""
+def _map(kind: _Kind, form: str = "alone") -> LinearMap:
+    """The variational equations as a linear map.
+
+    Args:
+        kind: of the map.
+        form: "alone", "lanes" to be vmapped, "vectorized" to be vmapped for many lanes.
+    """
 
     def path(r: Any) -> tuple[RecordedMotion, Any]:
         differentiable, arrays, setup, record = r
         problem = SplitProblem(differentiable, arrays, setup, kind.static)
         (y0, args, times), stepper = problem.motion, problem.stepper
-        fast = stepper.on_scalars(lanes)
-        return path_of(stepper, y0, args, times, record, kind.moving, fast, lanes), y0
+        fast = stepper.on_scalars(lanes=form == "lanes")
+        return path_of(stepper, y0, args, times, record, kind.moving, fast, form), y0
 
     def forward(r: Any, x: InputTangents) -> SolveTangents:
         return tangent_sweep(path(r)[0], x, kind.points)
@@ -115,9 +125,30 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
         y0_dot, *times_dot = dots
         return jax.jvp(motion, given, (y0_dot, list(x.args), *times_dot))[1]
 
-    in_lanes = None if lanes else _map(kind, lanes=True)
     reverse = backward if kind.static.capacity else by_directions
-    return LinearMap(forward, reverse, plain, in_lanes=in_lanes)
+    if form != "alone":
+        return LinearMap(forward, reverse, plain)
+    in_lanes = _map(kind, "lanes")
+    many = _vectorized(kind, in_lanes) if kind.vectorizes else None
+    return LinearMap(forward, reverse, plain, in_lanes=in_lanes, many=many)
+
+
+def _vectorized(kind: _Kind, in_lanes: LinearMap) -> Many:
+    """The map of many trajectories, whose steps back are one vectorized loop over them."""
+    vectorized = _map(kind, "vectorized")
+
+    def backward(r: Any, y: SolveTangents) -> InputTangents:
+        try:
+            return vectorized.backward(r, y)
+        except NotVectorizable:
+            return in_lanes.backward(r, y)
+
+    def steps(r: Any) -> Array:
+        record = r[-1]
+        return record.steps
+
+    suits = partial(is_faster_vectorized, max_steps=kind.static.max_steps)
+    return Many(replace(in_lanes, backward=backward, at_once=WIDTH), suits, steps)
 
 
 def _transposed(function: Callable, like: Any, y: Any) -> Any:
@@ -149,26 +180,31 @@ def path_of(
     record: Record,
     moving: tuple[int, ...],
     fast: Stepper | None = None,
-    lanes: bool = False,
+    form: str = "alone",
 ) -> RecordedMotion:
-    """The recorded motion, with steps that loop over their stages.
+    """The recorded motion, with steps that loop over their stages unless it is vectorized.
 
     Unrolled, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
     pendulum: a gradient 5.3 | 2.3 s, a Hessian 22 | 4.5 s, a gradient of lanes 15 | 4.5 s) and
     run 0.9 to 1.4 times as fast.
     """
-    looped = in_loops(stepper if fast is None else fast)
+    vectorized = form == "vectorized"
+    taken = stepper if fast is None else fast
+    taken = taken if vectorized else in_loops(taken)
 
     def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array, wanted: Array) -> PyTree:
-        return one_step(looped, args, t0, t1, state, jump, True, wanted)[0]
+        return one_step(taken, args, t0, t1, state, jump, True, wanted)[0]
 
     zero = jnp.zeros_like(times.stop)
     memory = stepper.begin(zero, times.stop, y0, args) if remembers(stepper.solver) else None
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(stepper.solver, "tableau", None), "num_stages", 0)
     clock, start = StepTimes(times, record), (y0, memory)
-    plain = not (lanes and record.save_step is not None)
-    return RecordedMotion(step, start, leaves, tree, moving, stepper.windows, clock, stages, plain)
+    plain = form == "alone" or (form == "lanes" and record.save_step is None)
+    evaluate = lane_call if vectorized else lambda function, *args: function(*args)
+    parts = leaves, tree, moving, stepper.windows, clock, stages, plain
+    lockstep = not vectorized or record.save_step is None
+    return RecordedMotion(step, start, *parts, lockstep, evaluate)
 
 
 def in_loops(stepper: Stepper) -> Stepper:

@@ -332,7 +332,8 @@ def saved_on(
         reaches = set_entry(reaches, slot, jnp.where(to_save, aim.reach, 0))
     if steps is not None:
         # The slot after the last save is unused: it stays beyond all steps.
-        beyond = steps[-1]
+        assert c.buffers is not None
+        beyond = jnp.full((), c.buffers.offsets.shape[0], jnp.int32)
         steps = set_entry(steps, slot, jnp.where(to_save, saved.step, beyond))
     return SaveProgress(
         base=select(take, c.at, saved.base),

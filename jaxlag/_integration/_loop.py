@@ -9,6 +9,7 @@ this is as accurate as the method is, and the loop body contains one step only.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -67,8 +68,7 @@ def integrate(
         room: capacity for states on the way, an even number. When it is full, every second state is
             dropped, and from then on half as many are stored.
         native: function that calls the loop with its initial state.
-        vectorized: whether this is vmapped, and the loop is one vectorized loop over the lanes; not
-            with a record.
+        vectorized: whether this is vmapped, and the loop is one vectorized loop over the lanes.
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
@@ -136,8 +136,10 @@ def integrate(
     def cond_fun(c: Any) -> Array:
         return eqxi.unvmap_any(goes_on(c))
 
+    never_full = room in (0, size)
+
     def run(dynamic: Any) -> Any:
-        if room in (0, size):
+        if never_full:
             return jax.lax.while_loop(cond_fun, body_fun, dynamic)
         until_full = lambda c: cond_fun(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, body_fun, c)  # noqa: E731
@@ -147,7 +149,8 @@ def integrate(
         return _outcome(eqx.combine(dynamic, static), times, y0, allowed)
 
     if vectorized:
-        return lane_loop(goes_on, body_fun, ended, dynamic)
+        pause = () if never_full else (partial(is_full, room=room), partial(thin, room=room))
+        return lane_loop(goes_on, body_fun, ended, dynamic, *pause)
     final = run(dynamic) if native is None else native(run, dynamic)
     return ended(final)
 

@@ -94,14 +94,12 @@ def thin(c: Any, room: int) -> Any:
     def halved(leaf: Array) -> Array:
         return leaf.at[: room // 2].set(leaf[:room:2])
 
-    def thin(buffers: Any) -> Any:
-        return buffers._replace(
-            points=jax.tree.map(halved, buffers.points), stride=2 * buffers.stride
-        )
+    def thinned(points: PyTree, stride: Array) -> tuple[PyTree, Array]:
+        return jax.tree.map(halved, points), 2 * stride
 
-    return c._replace(
-        buffers=jax.lax.cond(is_full(c, room), thin, lambda buffers: buffers, c.buffers)
-    )
+    given = c.buffers.points, c.buffers.stride
+    points, stride = jax.lax.cond(is_full(c, room), thinned, lambda *same: same, *given)
+    return c._replace(buffers=c.buffers._replace(points=points, stride=stride))
 
 
 def write_step(

@@ -1,6 +1,6 @@
 """Interpreter of a jaxpr on numpy arrays, without compilation: the reference for programs.
 
-NUMPY holds primitives as functions of (equation, operands).
+NUMPY and PARTS hold primitives as functions of (equation, operands).
 """
 
 from collections.abc import Callable, Sequence
@@ -98,8 +98,8 @@ def operation_of(eqn: Any) -> Callable[[list], list]:
             # Integers keep their width, in which they wrap; real numbers are computed in double.
             return lambda operands: [np.asarray(function(eqn, *operands)).astype(kind)]
         return lambda operands: [np.asarray(function(eqn, *operands))]
-    if name in _PARTS:
-        part = _PARTS[name]
+    if name in PARTS:
+        part = PARTS[name]
         return lambda operands: part(eqn, *operands)
     return partial(_by_jax, eqn)
 
@@ -278,4 +278,4 @@ def _iota(eqn: Any) -> list:
 
 
 # Other primitives of derivatives; not in NUMPY, which holds primitives with a scalar form.
-_PARTS: dict[str, Callable] = {"pad": _pad, "split": _split, "unstack": _unstack, "iota": _iota}
+PARTS: dict[str, Callable] = {"pad": _pad, "split": _split, "unstack": _unstack, "iota": _iota}

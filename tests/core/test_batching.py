@@ -1,5 +1,6 @@
 """Vmapped solves in chunks of lanes, compared with the same trajectories one by one."""
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,6 @@ from _jaxprs import operations
 
 import jaxlag as jl
 from jaxlag._core import _batching, _xla
-from jaxlag._core._buffer_entries import set_entry
 from systems import double_pendulum
 
 EPS = np.finfo(float).eps
@@ -132,32 +132,18 @@ def test_implicit_methods_run_in_larger_chunks():
     assert all(shape[0] == 44 for shape in shapes if len(shape) > 2)
 
 
-@pytest.mark.parametrize("lanes", [3, 2 * _batching.LANES + 1])
-@pytest.mark.parametrize("dtype", [float, np.int32])
-def test_set_entry_writes_at_the_index_of_each_lane(lanes, dtype):
-    rng = np.random.default_rng(0)
-    buffer = jnp.asarray(rng.integers(0, 9, (lanes, 5, 2)), dtype)
-    entry = jnp.asarray(rng.integers(0, 9, (lanes, 2)))
-    index = jnp.asarray(rng.integers(0, 5, lanes), jnp.int32)
-    right = np.array(buffer)
-    right[np.arange(lanes), index] = entry
-    each = jax.vmap(set_entry)
-    np.testing.assert_array_equal(jax.jit(each)(buffer, index, entry), right)
-    same = np.array(buffer)
-    same[:, 2] = entry[0]
-    several = jax.vmap(set_entry, (0, None, None))(buffer, jnp.asarray(2), entry[0])
-    np.testing.assert_array_equal(several, same)
-    assert several.dtype == dtype
-    # Directions within trajectories, and trajectories within directions.
-    once, twice = jax.vmap(set_entry, (0, None, 0)), jnp.stack([buffer, 2 * buffer], 1)
-    found = jax.jit(jax.vmap(once))(twice, index, jnp.stack([entry, 2 * entry], 1))
-    np.testing.assert_array_equal(found, np.stack([right, 2 * right], 1))
-    found = jax.jit(jax.vmap(each, (1, None, 1)))(twice, index, jnp.stack([entry, 2 * entry], 1))
-    np.testing.assert_array_equal(found, np.stack([right, 2 * right]))
-    if dtype is float:  # linear in the buffer and the entry
-        entry = entry.astype(dtype)
-        dots = jax.jvp(lambda b, r: each(b, index, r), (buffer, entry), (-buffer, -entry))
-        np.testing.assert_array_equal(dots[1], -right)
+@pytest.mark.parametrize(("count", "even"), [(3, True), (7, True), (7, False)])
+def test_lanes_run_in_a_given_order_and_keep_their_places(count, even):
+    """Each part has consecutive lanes of the order; what runs together shares the maximum."""
+    x = jnp.asarray(np.random.default_rng(0).permutation(count))
+
+    def together(x):
+        return x, eqxi.unvmap_max(x)
+
+    same, largest = _batching.in_batches(together, x, count, 4, even, order=jnp.argsort(x))
+    np.testing.assert_array_equal(same, x)
+    most = 2 if count == 3 else np.where(x < 4, 3, 6)
+    np.testing.assert_array_equal(largest, most)
 
 
 def test_explain_states_the_chunk_size():

@@ -10,6 +10,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._jaxprs import called
+from jaxlag._core._linear_map import program_of
 from jaxlag._tracing._interpret import held
 
 BARRIER = "optimization_barrier"
@@ -151,7 +152,7 @@ def _flat_program(program: ClosedJaxpr) -> FlatProgram:
 
         for eqn in jaxpr.eqns:
             operands = tuple(map(read, eqn.invars))
-            inner, results = called(eqn), list[Value]()
+            inner, results = called(eqn) or program_of(eqn), list[Value]()
             if inner is not None and concrete(inner.consts):
                 results = add(inner, list(map(held, inner.consts)), operands)
             else:

@@ -22,15 +22,23 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching
 from jaxtyping import Array, PyTree
 
+from jaxlag._core._buffer_entries import is_set_entry, set_entries
 from jaxlag._integration._vector_loop._flat_program import FlatProgram, Value, flat
-from jaxlag._integration._vector_loop._lane_map import MULTIPLE, WIDTH, lane_map
+from jaxlag._integration._vector_loop._lane_map import MULTIPLE, WIDTH, array_of, on_rows, rows_of
 from jaxlag._integration._vector_loop._turn import Turn, changing, split, turn_of
 
 _loop_p = Primitive("lane_loop")
 _loop_p.multiple_results = True
 
 
-def lane_loop(cond: Callable, body: Callable, results: Callable, init: PyTree) -> PyTree:
+def lane_loop(
+    cond: Callable,
+    body: Callable,
+    results: Callable,
+    init: PyTree,
+    is_due: Callable | None = None,
+    between: Callable | None = None,
+) -> PyTree:
     """results(x) of the last x, under `jax.vmap` only.
 
     Args:
@@ -38,6 +46,8 @@ def lane_loop(cond: Callable, body: Callable, results: Callable, init: PyTree) -
         body: x -> x.
         results: of x.
         init: x at the start, a pytree of arrays.
+        is_due: whether `between` comes before the next turn; None if it never does.
+        between: x -> x, seldom and not vectorized.
 
     Raises:
         NotVectorizable: the body has no form on numbers.
@@ -47,7 +57,8 @@ def lane_loop(cond: Callable, body: Callable, results: Callable, init: PyTree) -
     def of(function: Callable) -> Callable:
         return lambda *leaves: jax.tree.leaves(function(jax.tree.unflatten(tree, leaves)))
 
-    programs, consts = zip(*(flat(of(f), *leaves) for f in (cond, body, results)), strict=True)
+    functions = [x for x in (cond, body, results, is_due, between) if x is not None]
+    programs, consts = zip(*(flat(of(f), *leaves) for f in functions), strict=True)
     given = [x for part in consts for x in part]
     found = _loop_p.bind(*given, *leaves, programs=programs)
     return jax.tree.unflatten(jax.tree.structure(jax.eval_shape(results, init)), found)
@@ -55,7 +66,7 @@ def lane_loop(cond: Callable, body: Callable, results: Callable, init: PyTree) -
 
 @_loop_p.def_abstract_eval
 def _(*_: Any, programs: tuple[FlatProgram, ...]) -> list[Any]:
-    results = programs[-1]
+    results = programs[2]
     kinds = map(results.aval, results.outputs)
     return [ShapedArray(x.shape, x.dtype) for x in kinds]
 
@@ -93,6 +104,11 @@ class _Batch(NamedTuple):
         """That of one trajectory."""
         return self.array if self.axis is None else _entry(self.array, trajectory)
 
+    def of_all(self, count: int) -> Array:
+        """Those of all trajectories."""
+        shape = (count, *self.array.shape)
+        return jnp.broadcast_to(self.array, shape) if self.axis is None else self.array
+
 
 class _Lanes(NamedTuple):
     """The trajectories in the lanes.
@@ -102,13 +118,16 @@ class _Lanes(NamedTuple):
         state: the same of the state.
         trajectory: index of each; beyond the last one if a lane has none.
         following: index of the next one.
-        results: (trajectories, ...) of all that have ended.
+        kept: buffers of all trajectories by their place in the state, (trajectories, ...). The
+            state has empty arrays there.
+        results: the other results of all that have ended, (trajectories, ...).
     """
 
     consts: list[list[Array]]
     state: list[Array]
     trajectory: Array
     following: Array
+    kept: dict[int, Array]
     results: list[Array]
 
 
@@ -119,12 +138,15 @@ class _Loop(NamedTuple):
     """The loop over all lanes. Numbers are rows of lanes, by their number in the turn's program.
 
     Attributes:
-        programs: condition, body, results.
+        programs: condition, body, results other than kept buffers, and, if there are any, `is_due`
+            and `between`.
         consts: constants of each.
         start: the state at the start.
         count: number of trajectories.
         turn: the body in parts.
         moving: next values of the numbers that change and are needed.
+        kept: buffers that are results: place in the state -> place among the results. They are
+            written where they stay, because copies of them take longer than turns.
     """
 
     programs: Sequence[FlatProgram]
@@ -133,17 +155,28 @@ class _Loop(NamedTuple):
     count: int
     turn: Turn
     moving: dict[int, Value]
+    kept: dict[int, int]
 
     @classmethod
     def of(cls, programs: Any, consts: Any, start: list[_Batch], count: int) -> "_Loop":
         """The loop, prepared."""
         body, turn = programs[1], turn_of(programs[1])
         wanted = body.read_by(turn.before)
-        for program in (programs[0], programs[2]):
-            read = program.read_by(program.operations, program.outputs)
+        for k, program in enumerate(programs):
+            if k == 1:
+                continue
+            outputs: Sequence[Value] = program.outputs
+            if k == 4:  # the rest of the state passes through `between` unchanged
+                both = zip(program.inputs, outputs, strict=True)
+                outputs = [y for x, y in both if not isinstance(y, int) or y != x]
+            read = program.read_by(program.operations, outputs)
             pairs = zip(body.inputs, program.inputs, strict=True)
             wanted |= {x for x, same in pairs if same in read}
-        return cls(programs, consts, start, count, turn, changing(turn, wanted))
+        kept, results = _kept(programs, turn), programs[2]
+        outputs = [x for i, x in enumerate(results.outputs) if i not in kept.values()]
+        others = results._replace(operations=results.needed(outputs), outputs=tuple(outputs))
+        programs = [*programs[:2], others, *programs[3:]]
+        return cls(programs, consts, start, count, turn, changing(turn, wanted), kept)
 
     @property
     def size(self) -> int:
@@ -156,16 +189,29 @@ class _Loop(NamedTuple):
         """The results of all trajectories."""
         first = jnp.arange(self.size)
         loaded = jax.vmap(self.loaded)(jnp.minimum(first, self.count - 1))
+        kept = {place: self.start[place].of_all(self.count) for place in self.kept}
         kinds = [self.programs[2].aval(x) for x in self.programs[2].outputs]
         results = [jnp.zeros((self.count, *x.shape), x.dtype) for x in kinds]
-        carry = _Lanes(*loaded, first, jnp.asarray(self.size), results)
-        return lax.while_loop(
-            lambda lanes: jnp.any(self.busy(lanes)), self.until_one_ends, carry
-        ).results
+        lanes = _Lanes(*loaded, first, jnp.asarray(self.size), kept, results)
+        lanes = lax.while_loop(lambda x: jnp.any(self.busy(x)), self.until_one_ends, lanes)
+        found = list(lanes.results)
+        for place, i in sorted(self.kept.items(), key=lambda item: item[1]):
+            found.insert(i, lanes.kept[place])
+        return found
 
     def busy(self, lanes: _Lanes) -> Array:
         """Lanes with a trajectory."""
         return lanes.trajectory < self.count
+
+    def goes_on(self, lanes: _Lanes, state: list[Array]) -> Array:
+        """Lanes with a next turn."""
+        return self.vmapped(0, self.programs[0], lanes.consts, state)[0]
+
+    def is_due(self, lanes: _Lanes, state: list[Array]) -> Array:
+        """Lanes in which `between` comes first."""
+        if len(self.programs) == 3:
+            return jnp.zeros((self.size,), bool)
+        return self.vmapped(3, self.programs[3], lanes.consts, state)[0]
 
     def loaded(self, trajectory: Array) -> tuple[list[list[Array]], list[Array]]:
         """(constants, state) at the start of a trajectory."""
@@ -173,28 +219,53 @@ class _Loop(NamedTuple):
             [jnp.zeros(0) if x.axis is None else x.of(trajectory) for x in part]
             for part in self.consts
         ]
-        return consts, [x.of(trajectory) for x in self.start]
+        state = enumerate(self.start)
+        return consts, [jnp.zeros(0) if i in self.kept else x.of(trajectory) for i, x in state]
 
     def until_one_ends(self, lanes: _Lanes) -> _Lanes:
-        """Turns until a trajectory ends; its lane takes the next one."""
-        lanes = lanes._replace(state=self.turns(lanes))
-        goes_on = self.vmapped(0, self.programs[0], lanes.consts, lanes.state)[0]
-        lane = jnp.argmax(self.busy(lanes) & ~goes_on)
-        ended, state = jax.tree.map(lambda x: _entry(x, lane), (lanes.consts, lanes.state))
-        found = map(jnp.asarray, self.programs[2](self.whole(2, ended[2]), state))
-        index = _entry(lanes.trajectory, lane)
+        """Turns until a trajectory ends, whose lane takes the next one, or `between` is due.
+
+        What belongs to the other case is computed as well, and dropped.
+        """
+        lanes = self.turns(lanes)
+        goes_on = self.goes_on(lanes, lanes.state)
+        lane = jnp.argmax(self.busy(lanes) & ~(goes_on & ~self.is_due(lanes, lanes.state)))
+        ended, index = ~_entry(goes_on, lane), _entry(lanes.trajectory, lane)
+        consts, state = jax.tree.map(lambda x: _entry(x, lane), (lanes.consts, lanes.state))
+        # If the trajectory has not ended, these are replaced later.
+        found = map(jnp.asarray, self.programs[2](self.whole(2, consts[2]), state))
         results = [_put(x, index, y) for x, y in zip(lanes.results, found, strict=True)]
-        new = self.loaded(jnp.minimum(lanes.following, self.count - 1))
+        new, kept = self.loaded(jnp.minimum(lanes.following, self.count - 1)), lanes.kept
+        trajectory = lanes.following
+        if len(self.programs) > 3:
+            state, kept = self.between(kept, index, ended, consts, state)
+            new = jax.tree.map(lambda x, y: jnp.where(ended, x, y), new, (consts, state))
+            trajectory = jnp.where(ended, trajectory, index)
         consts, state = jax.tree.map(
             lambda x, y: _put(x, lane, y), (lanes.consts, lanes.state), new
         )
-        trajectory = _put(lanes.trajectory, lane, lanes.following)
-        return _Lanes(consts, state, trajectory, lanes.following + 1, results)
+        trajectory = _put(lanes.trajectory, lane, trajectory)
+        following = lanes.following + ended.astype(lanes.following.dtype)
+        return _Lanes(consts, state, trajectory, following, kept, results)
+
+    def between(
+        self, kept: dict[int, Array], index: Array, ended: Array, consts: list, state: list
+    ) -> tuple[list[Array], dict[int, Array]]:
+        """The state of a lane after `between`, and the kept buffers."""
+        program = self.programs[4]
+        read = program.read_by(program.operations)
+        pairs = enumerate(zip(program.inputs, program.outputs, strict=True))
+        used = [i for i, (x, after) in pairs if i in self.kept and (x in read or x != after)]
+        before = [_entry(kept[i], index) if i in used else x for i, x in enumerate(state)]
+        after = program(self.whole(4, consts[4]), before)
+        new = {i: _put(kept[i], index, jnp.where(ended, before[i], after[i])) for i in used}
+        pairs = enumerate(zip(state, after, strict=True))
+        return [x if i in self.kept else y for i, (x, y) in pairs], kept | new
 
     # ---- Turns ---------------------------------------------------------------------------------
 
-    def turns(self, lanes: _Lanes) -> list[Array]:
-        """The state after turns until a trajectory has ended."""
+    def turns(self, lanes: _Lanes) -> _Lanes:
+        """Turns until a trajectory has ended, or `between` is due."""
         body = self.turn.body
         consts = [
             x if batch.axis == 0 else jnp.broadcast_to(batch.array, (self.size, *batch.array.shape))
@@ -202,21 +273,23 @@ class _Loop(NamedTuple):
         ]
         values = *body.consts, *body.inputs
         known = dict(zip(values, (*consts, *lanes.state), strict=True))
+        empty = {body.inputs[i]: lanes.state[i] for i in self.kept}
         fixed: dict[int, Array] = {}
         for source in self.turn.elements.keys() & known.keys():
-            fixed |= dict(zip(self.turn.elements[source], _rows(known[source]), strict=True))
+            fixed |= dict(zip(self.turn.elements[source], rows_of(known[source]), strict=True))
 
         def state(carry: _Carry) -> list[Array]:
             rows, buffers = fixed | carry[0], carry[1]
             arrays = {
-                x: _array([rows[number] for number in self.turn.elements[x]], known[x])
+                x: array_of([rows[number] for number in self.turn.elements[x]], known[x])
                 for x in body.inputs
                 if x not in buffers
             }
-            return [(arrays | buffers)[x] for x in body.inputs]
+            return [(arrays | buffers | empty)[x] for x in body.inputs]
 
         def all_go_on(carry: _Carry) -> Array:
-            going = self.vmapped(0, self.programs[0], lanes.consts, state(carry))[0]
+            now = state(carry)
+            going = self.goes_on(lanes, now) & ~self.is_due(lanes, now)
             return jnp.all(going | ~self.busy(lanes))
 
         def one(carry: _Carry) -> _Carry:
@@ -224,39 +297,34 @@ class _Loop(NamedTuple):
             if self.turn.found:
                 found = self.vmapped(1, self.before, lanes.consts, state(carry))
             for x, array in zip(self.turn.found, found, strict=True):
-                rows |= dict(zip(self.turn.elements[x], _rows(array), strict=True))
-            return self.next(rows, carry[1])
+                rows |= dict(zip(self.turn.elements[x], rows_of(array), strict=True))
+            return self.next(rows, carry[1], lanes)
 
-        carry = {x: fixed[x] for x in self.moving}, {x: known[x] for x in self.turn.writes}
-        return state(lax.while_loop(all_go_on, one, carry))
+        kept = {body.inputs[i]: x for i, x in lanes.kept.items()}
+        buffers = {x: known[x] for x in self.turn.writes} | kept
+        carry = lax.while_loop(all_go_on, one, ({x: fixed[x] for x in self.moving}, buffers))
+        kept = {i: carry[1][body.inputs[i]] for i in self.kept}
+        return lanes._replace(state=state(carry), kept=kept)
 
-    def next(self, rows: dict[int, Array], buffers: dict[int, Array]) -> _Carry:
+    def next(self, rows: dict[int, Array], buffers: dict[int, Array], lanes: _Lanes) -> _Carry:
         """One turn, after the operations that come before."""
         turn, buffers = self.turn, dict(buffers)
         kinds = [turn.body.aval(x) for x in turn.written]
         count = sum(x.size for x in kinds)
-        new = self.on_rows([*self.moving.values(), *turn.numbers.last(count)], rows)
+        new = on_rows(turn.numbers, [*self.moving.values(), *turn.numbers.last(count)], rows)
         entries = split(turn.body, turn.written, new[len(self.moving) :])
         shapes = [jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype) for x in kinds]
-        given = list(map(_array, entries, shapes))
+        given = list(map(array_of, entries, shapes))
         for buffer, operation in turn.writes.items():
             count = len(operation.operands) - 1
-            (buffers[buffer],) = jax.vmap(operation)(buffers[buffer], *given[:count])
+            if turn.body.inputs.index(buffer) in self.kept:
+                entries, indices = given[:count]
+                given_to = lanes.trajectory, indices, entries, self.busy(lanes)
+                buffers[buffer] = set_entries(buffers[buffer], *given_to)
+            else:
+                (buffers[buffer],) = jax.vmap(operation)(buffers[buffer], *given[:count])
             given = given[count:]
         return dict(zip(self.moving, new, strict=False)), buffers
-
-    def on_rows(self, wanted: list[Value], rows: dict[int, Array]) -> list[Array]:
-        """Values of the program on numbers, for all lanes."""
-        program = self.turn.numbers
-        operations = program.needed(wanted)
-        read = sorted(program.read_by(operations, wanted))
-
-        def numbers(*entries: Any) -> list[Any]:
-            known = dict(zip(read, entries, strict=True))
-            return [jnp.asarray(x) for x in program.evaluate(operations, known, wanted)]
-
-        kinds = [program.aval(x).dtype for x in wanted]
-        return lane_map(numbers, [rows[x] for x in read], kinds)
 
     def before(self, consts: list, state: list) -> list:
         """Results of operations that come before a turn, of one lane."""
@@ -277,17 +345,6 @@ class _Loop(NamedTuple):
         return jax.vmap(function, in_axes=(axes, 0))(self.whole(k, consts[k]), state)
 
 
-def _rows(array: Array) -> list[Array]:
-    """The elements of (lanes, ...), (lanes,) each."""
-    flat = array.reshape(array.shape[0], -1)
-    return [flat[:, k] for k in range(flat.shape[1])]
-
-
-def _array(rows: Sequence[Array], like: Any) -> Array:
-    """The inverse of `_rows`, for arrays like this one."""
-    return jnp.stack(rows, 1).reshape(like.shape) if rows else jnp.zeros(like.shape, like.dtype)
-
-
 def _entry(array: Array, index: Array) -> Array:
     return lax.dynamic_index_in_dim(array, index, keepdims=False)
 
@@ -295,3 +352,20 @@ def _entry(array: Array, index: Array) -> Array:
 def _put(array: Array, index: Array, entry: Array) -> Array:
     """The array with one entry replaced; no scatter, which is not native code in a loop."""
     return lax.dynamic_update_index_in_dim(array, entry, index, 0)
+
+
+def _kept(programs: Sequence[FlatProgram], turn: Turn) -> dict[int, int]:
+    """Places in the state of buffers that are results, and their places among the results."""
+    _, body, results, *_ = programs
+    found = {}
+    for i, (x, same) in enumerate(zip(body.inputs, results.inputs, strict=True)):
+        outputs = enumerate(results.outputs)
+        given_back = [k for k, value in outputs if isinstance(value, int) and value == same]
+        if x not in turn.writes or not is_set_entry(turn.writes[x].params) or len(given_back) != 1:
+            continue
+        read = same in results.read_by(results.operations)
+        for program in (programs[0], *programs[3:4]):
+            read |= program.inputs[i] in program.read_by(program.operations, program.outputs)
+        if not read:
+            found[i] = given_back[0]
+    return found

@@ -17,10 +17,11 @@ from jaxlag._integration._vector_loop._flat_program import (
     Value,
     flat,
 )
-from jaxlag._tracing._interpret import NUMPY
+from jaxlag._tracing._interpret import NUMPY, PARTS
 
 _MOVES = frozenset(
-    """broadcast_in_dim concatenate reshape rev slice squeeze stack transpose""".split()  # noqa: SIM905
+    """broadcast_in_dim concatenate pad reshape rev slice split squeeze stack transpose
+    unstack""".split()  # noqa: SIM905
 )
 # A power with a constant exponent up to this, as in step-size controllers, is exp(y log x). It has
 # vector code. Its error is (1 + |y log x|) eps.
@@ -37,7 +38,7 @@ _REDUCTIONS = {
     "reduce_or": lax.bitwise_or,
 }
 _COMBINED = frozenset(_REDUCTIONS) | {"dot_general"}
-_SUPPORTED = ELEMENTWISE | _MOVES | _SAME | _COMBINED | {"iota", BARRIER}
+_SUPPORTED = ELEMENTWISE | _MOVES | _SAME | _COMBINED | {"add_any", "iota", BARRIER}
 
 
 def is_supported(program: FlatProgram, operation: Operation) -> bool:
@@ -95,11 +96,11 @@ def _executed(
             _objects(x.shape, [_element(operation, number) for number in x.ravel()])
             for x in operands
         ]
-    if name in ELEMENTWISE:
+    if name in ELEMENTWISE or name == "add_any":
         wide = [np.broadcast_to(x, shape).ravel() for x in operands]
         return [_objects(shape, [_element(operation, *x) for x in zip(*wide, strict=True)])]
     if name in _MOVES:
-        return [np.asarray(NUMPY[name](operation, *operands))]
+        return _moved(operation, operands)
     if name == "dot_general":
         return [_product(operation, operands, shape)]
     if name in _REDUCTIONS:
@@ -108,7 +109,21 @@ def _executed(
         return [numbers_of(operation()[0])]
 
 
+def _moved(operation: Operation, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The results of an operation that moves elements, found by moving their positions."""
+    elements, places = np.concatenate([x.ravel() for x in operands]), list[np.ndarray]()
+    for x in operands:
+        start = sum(y.size for y in places)
+        places.append(np.arange(start, start + x.size).reshape(x.shape))
+    name = operation.name
+    found = PARTS[name](operation, *places) if name in PARTS else [NUMPY[name](operation, *places)]
+    return [elements[np.ravel(x)].reshape(np.shape(x)) for x in found]
+
+
 def _element(operation: Operation, *numbers: Any) -> Any:
+    if operation.name == "add_any":  # cotangents, many of which are 0
+        x, y = numbers
+        return y if _is_zero(x) else x if _is_zero(y) else lax.add(*map(jnp.asarray, numbers))
     if operation.name == "pow":
         x, y = numbers
         if isinstance(y, np.ndarray) and 0.0 < abs(y) <= ROOTS:
@@ -120,6 +135,10 @@ def _element(operation: Operation, *numbers: Any) -> Any:
         root = lax.select(x < 0.0, jnp.full_like(x, jnp.nan), lax.sqrt(x))
         return root if operation.name == "sqrt" else 1.0 / root
     return operation(*map(jnp.asarray, numbers))[0]
+
+
+def _is_zero(number: Any) -> bool:
+    return isinstance(number, np.ndarray) and not number.any()
 
 
 def _product(
