@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,10 +47,13 @@ class Ending(NamedTuple):
 _PARTS = np.array([0.0, *[1.0] * 32, *2.0 ** np.arange(1, 7)]) / 32
 """Fractions of the failed step at which the equations are evaluated; some lie beyond its end."""
 
-_OPEN = (
-    *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
-    *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
-    Status.implicit_solve_failed,
+_OPEN = np.array(
+    [
+        *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
+        *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
+        Status.implicit_solve_failed,
+    ],
+    np.int32,
 )
 """Outcomes that `diagnose_failure` may refine."""
 
@@ -92,7 +96,7 @@ def is_open(ending: Ending) -> bool:
     """Whether `diagnose_failure` may refine an ending; True if it is traced."""
     if not concrete(ending.status):
         return True
-    return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
+    return bool(np.isin(np.asarray(ending.status), _OPEN).any())
 
 
 class MotionKey(NamedTuple):
@@ -130,25 +134,35 @@ def dynamics_of(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def diagnose_failure(scene: MotionKey, batch: int, given: Any) -> Ending:
-    """The endings, refined by an examination of the states around them.
+    """The endings, refined by an examination of the states around them if one may be refined.
 
     Args:
         scene: key of the motion.
         batch: number of batch axes.
-        given: (ending, last time, ts, q0, v0, x0, traced halves of params and inputs).
+        given: (ending, last time, last state (q, v, x), ts, q0, v0, x0, traced halves of params and
+            inputs).
     """
 
     def one(given: Any) -> Ending:
-        ending, time, ts, q0, v0, x0, params, inputs = stop_gradient(given)
+        ending, time, _, ts, q0, v0, x0, params, inputs = given
         # v0 does not exist if kinematics are singular at the start.
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
         dynamics, args = dynamics_of(scene, ts, (ts[0], q0, v0, x0), params, inputs)
         time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
-        return _explained(scene, dynamics, ending, time, tried, start, q0, args)
+        found = _explained(scene, dynamics, ending, time, tried, start, q0, args)
+        assert found.lost is not None
+        lost = [x.astype(y.dtype) for x, y in zip(found.lost, given[1:3], strict=True)]
+        return found._replace(lost=tuple(lost))
+
+    def known(given: Any) -> Ending:
+        ending, *lost = given[:3]
+        return ending._replace(lost=tuple(lost))
 
     for _ in range(batch):
         one = jax.vmap(one)
-    return one(given)
+    given = stop_gradient(given)
+    may_be_refined = eqxi.unvmap_any(jnp.isin(given[0].status, _OPEN))
+    return jax.lax.cond(may_be_refined, one, known, given)
 
 
 def _explained(

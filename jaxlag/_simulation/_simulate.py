@@ -13,6 +13,7 @@ from jaxlag._core import _xla
 from jaxlag._core._arguments import renamed, required
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
+from jaxlag._core._native_call import native_call
 from jaxlag._core._status import Status
 from jaxlag._gradient._differentiable_solve import solve
 from jaxlag._gradient._modes import capacity_for, most_steps
@@ -376,9 +377,8 @@ def _ran_out(motion: Solution) -> bool:
     return single and int(status) == int(Status.max_steps)
 
 
-@partial(_xla.QuickJit, static_argnums=0)
-def _simulate(plan: ProgramKey, values: Values) -> Solution:
-    """The compiled program: build the problem, solve it, compute the quantities of `save`."""
+def _motion(plan: ProgramKey, values: Values) -> Solution:
+    """The program: build the problem, solve it, compute the quantities of `save`."""
     values = with_jax_arrays(values)
     dynamics, start, problem = build_problem(plan, values)
     stepper: Stepper = eqx.combine(problem.setup.stepper, problem.stepper)
@@ -448,3 +448,9 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         tolerances=None if stepper.controller is None else (values.rtol, values.atol),
         dt_max=values.longest,
     )
+
+
+# Alone a program is called from Python, which takes longer, and should compile quickly.
+_simulate = _xla.QuickJit(
+    _motion, static_argnums=0, inside=lambda plan, x: native_call(partial(_motion, plan), x)
+)

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -99,8 +100,7 @@ class Solution(AbstractSolution):
     def status(self) -> Int[Array, "*batch"]:
         """How the motion ended: int32, see `Status`.
 
-        For a failed motion this examines the states around its end; inside jit and vmap it always
-        does.
+        For a failed motion this examines the states around its end.
         """
         return self._explained().status
 
@@ -132,7 +132,9 @@ class Solution(AbstractSolution):
         if not is_open(self._ending):
             return self._ending
         start = self.q[..., 0, :], self.v[..., 0, :], None if self.x is None else self.x[..., 0, :]
-        at = self._ending, self.last_time, self.ts, *start
+        last = (*self.last_state, *([] if self.last_x is None else [self.last_x]))
+        end = self.last_time, jnp.concatenate(last, axis=-1)
+        at = self._ending, *end, self.ts, *start
         batch = self.ts.ndim - 1
         return diagnose_failure(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
 

@@ -180,11 +180,11 @@ def test_attributes_have_the_effect_of_the_setting():
 
 def test_attributes_are_used_only_for_tested_versions(monkeypatch):
     monkeypatch.setattr(_xla, "in_force", lambda: False)
-    monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
+    monkeypatch.setattr(_xla, "ATTRIBUTES_TESTED", (jaxlib.__version__,))
     assert _xla.by_attribute()
-    monkeypatch.setattr(_xla, "TESTED", ())
+    monkeypatch.setattr(_xla, "ATTRIBUTES_TESTED", ())
     assert not _xla.by_attribute()
-    monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
+    monkeypatch.setattr(_xla, "ATTRIBUTES_TESTED", (jaxlib.__version__,))
     monkeypatch.setenv(_xla.ATTRIBUTE_SWITCH, "0")
     assert not _xla.by_attribute()
 
@@ -213,7 +213,7 @@ def test_only_plain_operations_are_marked():
 
     def plain(function, x):
         looped = lambda x: jax.lax.scan(lambda c, _: (function(c), None), x, None, 3)[0]  # noqa: E731
-        return _xla._plain(jax.make_jaxpr(looped)(x).jaxpr)
+        return _xla.is_plain(jax.make_jaxpr(looped)(x).jaxpr)
 
     M = jnp.eye(3)
     assert plain(lambda x: jnp.sin(x) + M[0] * x, M)
@@ -222,8 +222,8 @@ def test_only_plain_operations_are_marked():
     # vmap makes a matrix product of it, unless the vector holds coefficients of a method's stages.
     assert not plain(lambda x: jnp.eye(8) @ x, jnp.ones(8))
     body = jax.make_jaxpr(lambda x: jnp.ones(8) @ x)(jnp.ones((8, 4))).jaxpr
-    assert _xla._plain(body, stages=8)
-    assert not _xla._plain(body, stages=10)
+    assert _xla.is_plain(body, stages=8)
+    assert not _xla.is_plain(body, stages=10)
     assert not plain(jnp.linalg.cholesky, M)
     assert not plain(lambda x: jnp.linalg.solve(x, x), M)
     assert not plain(lambda x: jax.pure_callback(np.sin, x, x), M)
@@ -242,7 +242,7 @@ def test_scalar_programs_are_plain():
     )
     for traced in (one(q[0]), lanes(q)):
         assert "round" in str(traced)  # sines by polynomial
-        assert _xla._plain(traced.jaxpr)
+        assert _xla.is_plain(traced.jaxpr)
 
 
 def test_merged_flags_extend_existing_ones(monkeypatch):

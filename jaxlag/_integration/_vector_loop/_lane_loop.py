@@ -23,12 +23,30 @@ from jax.interpreters import batching
 from jaxtyping import Array, PyTree
 
 from jaxlag._core._buffer_entries import is_set_entry, set_entries
-from jaxlag._integration._vector_loop._flat_program import FlatProgram, Value, flat
+from jaxlag._integration._vector_loop._flat_program import Value, flat
 from jaxlag._integration._vector_loop._lane_map import MULTIPLE, WIDTH, array_of, on_rows, rows_of
 from jaxlag._integration._vector_loop._turn import Turn, changing, split, turn_of
 
 _loop_p = Primitive("lane_loop")
 _loop_p.multiple_results = True
+
+
+class _Parts(NamedTuple):
+    """What belongs to each program of a loop: the program itself, or its constants.
+
+    Attributes:
+        cond: condition.
+        body: body.
+        results: results.
+        is_due: whether `between` is due; None if it never is.
+        between: what comes between turns; None with `is_due`.
+    """
+
+    cond: Any
+    body: Any
+    results: Any
+    is_due: Any = None
+    between: Any = None
 
 
 def lane_loop(
@@ -60,29 +78,29 @@ def lane_loop(
     functions = [x for x in (cond, body, results, is_due, between) if x is not None]
     programs, consts = zip(*(flat(of(f), *leaves) for f in functions), strict=True)
     given = [x for part in consts for x in part]
-    found = _loop_p.bind(*given, *leaves, programs=programs)
+    found = _loop_p.bind(*given, *leaves, programs=_Parts(*programs))
     return jax.tree.unflatten(jax.tree.structure(jax.eval_shape(results, init)), found)
 
 
 @_loop_p.def_abstract_eval
-def _(*_: Any, programs: tuple[FlatProgram, ...]) -> list[Any]:
-    results = programs[2]
+def _(*_: Any, programs: _Parts) -> list[Any]:
+    results = programs.results
     kinds = map(results.aval, results.outputs)
     return [ShapedArray(x.shape, x.dtype) for x in kinds]
 
 
-def _batched(args: Sequence[Any], axes: Sequence[Any], *, programs: Any) -> tuple[list, list]:
+def _batched(args: Sequence[Any], axes: Sequence[Any], *, programs: _Parts) -> tuple[list, list]:
     count = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     given = [
         _Batch(jnp.asarray(x), None) if axis is None else _Batch(jnp.moveaxis(x, axis, 0), 0)
         for x, axis in zip(args, axes, strict=True)
     ]
     consts = []
-    for program in programs:
+    for program in filter(None, programs):
         size = len(program.consts)
         consts.append(given[:size])
         given = given[size:]
-    found = _Loop.of(programs, consts, given, count).run()
+    found = _Loop.of(programs, _Parts(*consts), given, count).run()
     return found, [0] * len(found)
 
 
@@ -123,7 +141,7 @@ class _Lanes(NamedTuple):
         results: the other results of all that have ended, (trajectories, ...).
     """
 
-    consts: list[list[Array]]
+    consts: _Parts
     state: list[Array]
     trajectory: Array
     following: Array
@@ -138,8 +156,7 @@ class _Loop(NamedTuple):
     """The loop over all lanes. Numbers are rows of lanes, by their number in the turn's program.
 
     Attributes:
-        programs: condition, body, results other than kept buffers, and, if there are any, `is_due`
-            and `between`.
+        programs: those of the loop; its results without the kept buffers.
         consts: constants of each.
         start: the state at the start.
         count: number of trajectories.
@@ -149,8 +166,8 @@ class _Loop(NamedTuple):
             written where they stay, because copies of them take longer than turns.
     """
 
-    programs: Sequence[FlatProgram]
-    consts: Sequence[list[_Batch]]
+    programs: _Parts
+    consts: _Parts
     start: list[_Batch]
     count: int
     turn: Turn
@@ -158,24 +175,22 @@ class _Loop(NamedTuple):
     kept: dict[int, int]
 
     @classmethod
-    def of(cls, programs: Any, consts: Any, start: list[_Batch], count: int) -> "_Loop":
+    def of(cls, programs: _Parts, consts: _Parts, start: list[_Batch], count: int) -> "_Loop":
         """The loop, prepared."""
-        body, turn = programs[1], turn_of(programs[1])
+        body, turn = programs.body, turn_of(programs.body)
         wanted = body.read_by(turn.before)
-        for k, program in enumerate(programs):
-            if k == 1:
-                continue
+        for program in filter(None, programs._replace(body=None)):
             outputs: Sequence[Value] = program.outputs
-            if k == 4:  # the rest of the state passes through `between` unchanged
+            if program is programs.between:  # the rest of the state passes through unchanged
                 both = zip(program.inputs, outputs, strict=True)
                 outputs = [y for x, y in both if not isinstance(y, int) or y != x]
             read = program.read_by(program.operations, outputs)
             pairs = zip(body.inputs, program.inputs, strict=True)
             wanted |= {x for x, same in pairs if same in read}
-        kept, results = _kept(programs, turn), programs[2]
+        kept, results = _kept(programs, turn), programs.results
         outputs = [x for i, x in enumerate(results.outputs) if i not in kept.values()]
         others = results._replace(operations=results.needed(outputs), outputs=tuple(outputs))
-        programs = [*programs[:2], others, *programs[3:]]
+        programs = programs._replace(results=others)
         return cls(programs, consts, start, count, turn, changing(turn, wanted), kept)
 
     @property
@@ -190,7 +205,7 @@ class _Loop(NamedTuple):
         first = jnp.arange(self.size)
         loaded = jax.vmap(self.loaded)(jnp.minimum(first, self.count - 1))
         kept = {place: self.start[place].of_all(self.count) for place in self.kept}
-        kinds = [self.programs[2].aval(x) for x in self.programs[2].outputs]
+        kinds = map(self.programs.results.aval, self.programs.results.outputs)
         results = [jnp.zeros((self.count, *x.shape), x.dtype) for x in kinds]
         lanes = _Lanes(*loaded, first, jnp.asarray(self.size), kept, results)
         lanes = lax.while_loop(lambda x: jnp.any(self.busy(x)), self.until_one_ends, lanes)
@@ -205,22 +220,26 @@ class _Loop(NamedTuple):
 
     def goes_on(self, lanes: _Lanes, state: list[Array]) -> Array:
         """Lanes with a next turn."""
-        return self.vmapped(0, self.programs[0], lanes.consts, state)[0]
+        return _vmapped(self.programs.cond, self.consts.cond, lanes.consts.cond, state)[0]
 
     def is_due(self, lanes: _Lanes, state: list[Array]) -> Array:
         """Lanes in which `between` comes first."""
-        if len(self.programs) == 3:
+        is_due = self.programs.is_due
+        if is_due is None:
             return jnp.zeros((self.size,), bool)
-        return self.vmapped(3, self.programs[3], lanes.consts, state)[0]
+        return _vmapped(is_due, self.consts.is_due, lanes.consts.is_due, state)[0]
 
-    def loaded(self, trajectory: Array) -> tuple[list[list[Array]], list[Array]]:
+    def loaded(self, trajectory: Array) -> tuple[_Parts, list[Array]]:
         """(constants, state) at the start of a trajectory."""
-        consts = [
-            [jnp.zeros(0) if x.axis is None else x.of(trajectory) for x in part]
-            for part in self.consts
-        ]
-        state = enumerate(self.start)
-        return consts, [jnp.zeros(0) if i in self.kept else x.of(trajectory) for i, x in state]
+
+        def own(batches: list[_Batch] | None) -> list[Array] | None:
+            if batches is None:
+                return None
+            return [jnp.zeros(0) if x.axis is None else x.of(trajectory) for x in batches]
+
+        starts = enumerate(self.start)
+        state = [jnp.zeros(0) if i in self.kept else x.of(trajectory) for i, x in starts]
+        return _Parts(*map(own, self.consts)), state
 
     def until_one_ends(self, lanes: _Lanes) -> _Lanes:
         """Turns until a trajectory ends, whose lane takes the next one, or `between` is due.
@@ -233,11 +252,12 @@ class _Loop(NamedTuple):
         ended, index = ~_entry(goes_on, lane), _entry(lanes.trajectory, lane)
         consts, state = jax.tree.map(lambda x: _entry(x, lane), (lanes.consts, lanes.state))
         # If the trajectory has not ended, these are replaced later.
-        found = map(jnp.asarray, self.programs[2](self.whole(2, consts[2]), state))
+        given = _whole(self.consts.results, consts.results)
+        found = map(jnp.asarray, self.programs.results(given, state))
         results = [_put(x, index, y) for x, y in zip(lanes.results, found, strict=True)]
         new, kept = self.loaded(jnp.minimum(lanes.following, self.count - 1)), lanes.kept
         trajectory = lanes.following
-        if len(self.programs) > 3:
+        if self.programs.between is not None:
             state, kept = self.between(kept, index, ended, consts, state)
             new = jax.tree.map(lambda x, y: jnp.where(ended, x, y), new, (consts, state))
             trajectory = jnp.where(ended, trajectory, index)
@@ -249,15 +269,15 @@ class _Loop(NamedTuple):
         return _Lanes(consts, state, trajectory, following, kept, results)
 
     def between(
-        self, kept: dict[int, Array], index: Array, ended: Array, consts: list, state: list
+        self, kept: dict[int, Array], index: Array, ended: Array, consts: _Parts, state: list
     ) -> tuple[list[Array], dict[int, Array]]:
         """The state of a lane after `between`, and the kept buffers."""
-        program = self.programs[4]
+        program = self.programs.between
         read = program.read_by(program.operations)
         pairs = enumerate(zip(program.inputs, program.outputs, strict=True))
         used = [i for i, (x, after) in pairs if i in self.kept and (x in read or x != after)]
         before = [_entry(kept[i], index) if i in used else x for i, x in enumerate(state)]
-        after = program(self.whole(4, consts[4]), before)
+        after = program(_whole(self.consts.between, consts.between), before)
         new = {i: _put(kept[i], index, jnp.where(ended, before[i], after[i])) for i in used}
         pairs = enumerate(zip(state, after, strict=True))
         return [x if i in self.kept else y for i, (x, y) in pairs], kept | new
@@ -269,7 +289,7 @@ class _Loop(NamedTuple):
         body = self.turn.body
         consts = [
             x if batch.axis == 0 else jnp.broadcast_to(batch.array, (self.size, *batch.array.shape))
-            for x, batch in zip(lanes.consts[1], self.consts[1], strict=True)
+            for x, batch in zip(lanes.consts.body, self.consts.body, strict=True)
         ]
         values = *body.consts, *body.inputs
         known = dict(zip(values, (*consts, *lanes.state), strict=True))
@@ -295,7 +315,8 @@ class _Loop(NamedTuple):
         def one(carry: _Carry) -> _Carry:
             rows, found = fixed | carry[0], []
             if self.turn.found:
-                found = self.vmapped(1, self.before, lanes.consts, state(carry))
+                given = self.consts.body, lanes.consts.body, state(carry)
+                found = _vmapped(self.before, *given)
             for x, array in zip(self.turn.found, found, strict=True):
                 rows |= dict(zip(self.turn.elements[x], rows_of(array), strict=True))
             return self.next(rows, carry[1], lanes)
@@ -332,17 +353,19 @@ class _Loop(NamedTuple):
         known = dict(zip((*body.consts, *body.inputs), (*consts, *state), strict=True))
         return body.evaluate(self.turn.before, known, self.turn.found)
 
-    def whole(self, k: int, consts: list[Array]) -> list[Array]:
-        """Constants of a program, with those that all trajectories share."""
-        pairs = zip(self.consts[k], consts, strict=True)
-        return [x if batch.axis == 0 else batch.array for batch, x in pairs]
 
-    def vmapped(
-        self, k: int, function: Callable, consts: list[list[Array]], state: list[Array]
-    ) -> list[Array]:
-        """function(constants of a program, state) of all lanes."""
-        axes = [x.axis for x in self.consts[k]]
-        return jax.vmap(function, in_axes=(axes, 0))(self.whole(k, consts[k]), state)
+def _vmapped(
+    function: Callable, batches: list[_Batch], consts: list[Array], state: list[Array]
+) -> list[Array]:
+    """function(constants, state) of all lanes."""
+    axes = [x.axis for x in batches]
+    return jax.vmap(function, in_axes=(axes, 0))(_whole(batches, consts), state)
+
+
+def _whole(batches: list[_Batch], consts: list[Array]) -> list[Array]:
+    """Constants, with those that all trajectories share."""
+    pairs = zip(batches, consts, strict=True)
+    return [x if batch.axis == 0 else batch.array for batch, x in pairs]
 
 
 def _entry(array: Array, index: Array) -> Array:
@@ -354,9 +377,9 @@ def _put(array: Array, index: Array, entry: Array) -> Array:
     return lax.dynamic_update_index_in_dim(array, entry, index, 0)
 
 
-def _kept(programs: Sequence[FlatProgram], turn: Turn) -> dict[int, int]:
+def _kept(programs: _Parts, turn: Turn) -> dict[int, int]:
     """Places in the state of buffers that are results, and their places among the results."""
-    _, body, results, *_ = programs
+    body, results = programs.body, programs.results
     found = {}
     for i, (x, same) in enumerate(zip(body.inputs, results.inputs, strict=True)):
         outputs = enumerate(results.outputs)
@@ -364,7 +387,7 @@ def _kept(programs: Sequence[FlatProgram], turn: Turn) -> dict[int, int]:
         if x not in turn.writes or not is_set_entry(turn.writes[x].params) or len(given_back) != 1:
             continue
         read = same in results.read_by(results.operations)
-        for program in (programs[0], *programs[3:4]):
+        for program in filter(None, (programs.cond, programs.is_due)):
             read |= program.inputs[i] in program.read_by(program.operations, program.outputs)
         if not read:
             found[i] = given_back[0]
