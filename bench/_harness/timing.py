@@ -11,6 +11,7 @@ import jax
 
 BENCHMARKS = (
     "solve",
+    "calls",
     "first-result",
     "batch",
     "gradient",

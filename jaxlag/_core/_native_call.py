@@ -33,8 +33,14 @@ def native_call(function: Callable, *args: PyTree) -> PyTree:
     program, like = jax.make_jaxpr(
         lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True
     )(*leaves)
-    found = _called(program, leaves) if not program.effects else jaxpr_as_fun(program)(*leaves)
+    marks = _only_lowering_remains(program)
+    found = _called(program, leaves) if marks else jaxpr_as_fun(program)(*leaves)
     return jax.tree.unflatten(jax.tree.structure(like), found)
+
+
+def _only_lowering_remains(program: ClosedJaxpr) -> bool:
+    """Whether a program has no effects, and no operations that JAX 0.12 replaces before that."""
+    return not program.effects and not getattr(program.jaxpr, "is_high", False)
 
 
 def _called(program: ClosedJaxpr, leaves: Sequence[Any]) -> list[Any]:
@@ -77,9 +83,16 @@ def _as_it_is(*args: Any, program: ClosedJaxpr) -> list:
 
 
 def _on_cpu(*args: Any, program: ClosedJaxpr) -> list:
-    if _xla.may_mark() and all(map(_is_native, equations(program))):
+    known = all(map(_is_known, program.in_avals))
+    if _xla.may_mark() and known and all(map(_is_native, equations(program))):
         return _xla.marked(jaxpr_as_fun(written_out(program)), args)
     return _as_it_is(*args, program=program)
+
+
+def _is_known(aval: Any) -> bool:
+    """Whether an array has numbers as sizes, not symbols of `jax.export`, and no random keys."""
+    extended = jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
+    return not extended and all(isinstance(n, int) for n in aval.shape)
 
 
 def _is_native(eqn: Any) -> bool:

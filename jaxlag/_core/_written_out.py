@@ -21,7 +21,9 @@ from jaxlag._core._jaxprs import rewritten, within
 
 TERMS = 64
 """Largest number of terms of a sum, or of written entries."""
-ENTRIES = 4096
+FACTORS = 12
+"""Largest number of terms of a product of arrays. From 16 on libraries are faster."""
+ENTRIES = 1024
 """Largest size of the factors of a product."""
 COLUMNS = 16
 """Largest number of rows and columns of a matrix that is factored."""
@@ -36,14 +38,15 @@ def written_out(program: ClosedJaxpr) -> ClosedJaxpr:
             return eqn
         rule = _RULES[eqn.primitive.name]
         kinds = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
-        shapes = ((x.shape, x.dtype) for x in kinds)
-        # Equations with programs of their own have one form each.
-        key = id(eqn) if any(within(eqn)) else (eqn.primitive.name, repr(eqn.params), *shapes)
+        key = None
+        if not any(within(eqn)):  # texts of programs may be equal where they are not
+            key = eqn.primitive.name, repr(eqn.params), *((x.shape, x.dtype) for x in kinds)
         call = known.get(key)
         if call is None:
             code = jax.make_jaxpr(jax.jit(lambda *args: rule.function(eqn.params, *args)))(*kinds)
             (call,) = code.jaxpr.eqns
-            known[key] = call
+            if key is not None:
+                known[key] = call
         return eqn.replace(primitive=call.primitive, params=call.params)
 
     return rewritten(program, replaced)
@@ -106,15 +109,14 @@ def _index_of(is_better: Callable) -> Callable:
 
 def _product(params: Any, a: Array, b: Array) -> Array:
     (left, right), (left_batch, right_batch) = params["dimension_numbers"]
-    kind = params["preferred_element_type"] or a.dtype
     rows = [i for i in range(a.ndim) if i not in (*left, *left_batch)]
     columns = [i for i in range(b.ndim) if i not in (*right, *right_batch)]
     batch = [a.shape[i] for i in left_batch]
     free = [a.shape[i] for i in rows], [b.shape[i] for i in columns]
     count = int(np.prod([a.shape[i] for i in left]))
     wide = [*batch, *free[0], *[1] * len(columns)], [*batch, *[1] * len(rows), *free[1]]
-    a = a.transpose([*left, *left_batch, *rows]).reshape(count, *wide[0]).astype(kind)
-    b = b.transpose([*right, *right_batch, *columns]).reshape(count, *wide[1]).astype(kind)
+    a = a.transpose([*left, *left_batch, *rows]).reshape(count, *wide[0])
+    b = b.transpose([*right, *right_batch, *columns]).reshape(count, *wide[1])
     return reduce(lax.add, [x * y for x, y in zip(_parts(a), _parts(b), strict=True)])
 
 
@@ -219,6 +221,8 @@ def _scattered(combine: Callable) -> Callable:
         numbers = params["dimension_numbers"]
         axis = int(numbers.scatter_dims_to_operand_dims[0])
         indices = indices.reshape(-1)
+        if indices.dtype.itemsize < 4:
+            indices = indices.astype(jnp.int32)
         if params["mode"] == lax.GatherScatterMode.CLIP:
             indices = jnp.clip(indices, 0, array.shape[axis] - 1)
         inside = numbers.update_window_dims
@@ -239,14 +243,22 @@ def _scattered(combine: Callable) -> Callable:
 
 def _is_few(eqn: Any) -> bool:
     x = eqn.invars[0].aval
-    return 0 < int(np.prod([x.shape[i] for i in eqn.params["axes"]])) <= TERMS
+    few = 0 < int(np.prod([x.shape[i] for i in eqn.params["axes"]])) <= TERMS
+    return few and not _is_half(x.dtype)
 
 
 def _are_small(eqn: Any) -> bool:
     a, b = (x.aval for x in eqn.invars)
     (left, _), _ = eqn.params["dimension_numbers"]
-    few = 0 < int(np.prod([a.shape[i] for i in left])) <= TERMS
-    return few and max(a.size, b.size) <= ENTRIES
+    few = 0 < int(np.prod([a.shape[i] for i in left])) <= FACTORS
+    kinds = {a.dtype, b.dtype, eqn.outvars[0].aval.dtype}
+    numbers = len(kinds) == 1 and jnp.issubdtype(a.dtype, jnp.number) and not _is_half(a.dtype)
+    return bool(few and numbers and max(a.size, b.size) <= ENTRIES)
+
+
+def _is_half(dtype: Any) -> bool:
+    """Whether XLA adds up such numbers in a wider type."""
+    return jnp.issubdtype(dtype, jnp.floating) and dtype.itemsize < 4
 
 
 def _is_matrix(eqn: Any) -> bool:
@@ -257,11 +269,20 @@ def _is_matrix(eqn: Any) -> bool:
     return bool(real and small and not eqn.params.get("pivoting"))
 
 
+def _is_set(eqn: Any) -> bool:
+    """Whether entries are set; `array.at[].apply` is the same operation with a program."""
+    return eqn.params["update_jaxpr"] is None and _is_along_one_axis(eqn)
+
+
 def _is_along_one_axis(eqn: Any) -> bool:
     numbers, indices = eqn.params["dimension_numbers"], eqn.invars[1].aval
     axes = tuple(map(int, numbers.scatter_dims_to_operand_dims))
     one = len(axes) == 1 and axes == tuple(map(int, numbers.inserted_window_dims))
-    return one and not numbers.operand_batching_dims and 0 < indices.size <= TERMS
+    if not one or numbers.operand_batching_dims or not 0 < indices.size <= TERMS:
+        return False
+    array, _, entries = (x.aval for x in eqn.invars)
+    whole = [n for i, n in enumerate(array.shape) if i not in axes]
+    return [entries.shape[i] for i in numbers.update_window_dims] == whole
 
 
 _RULES = {
@@ -277,6 +298,6 @@ _RULES = {
     "qr": _Rule(_of_each(_qr), _is_matrix),
     "triangular_solve": _Rule(_of_each(_triangular), _is_matrix),
     "custom_linear_solve": _Rule(_solved, lambda eqn: True),
-    "scatter": _Rule(_scattered(lambda old, new: new), _is_along_one_axis),
+    "scatter": _Rule(_scattered(lambda old, new: new), _is_set),
     "scatter-add": _Rule(_scattered(lax.add), _is_along_one_axis),
 }

@@ -236,8 +236,13 @@ def is_plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
 
 
 def is_plain_operation(eqn: Any, stages: int = 0) -> bool:
-    """Whether an operation is one on numbers that XLA itself emits code for."""
+    """Whether an operation is one on numbers that XLA itself emits code for.
+
+    Sums of more than some thousand numbers call a library.
+    """
     name = eqn.primitive.name
+    if name in _REDUCTIONS:
+        return eqn.invars[0].aval.size <= SUMMED
     return _is_sum(eqn, stages) if name == "dot_general" else name in _PLAIN
 
 
@@ -254,7 +259,9 @@ def _is_sum(dot: Any, stages: int) -> bool:
     return not any(batched) and any(size in (stages - 1, stages) for size in rows)
 
 
-_PLAIN = frozenset(
+SUMMED = 1024
+_REDUCTIONS = frozenset(("reduce_sum", "reduce_prod", "reduce_max", "reduce_min"))
+_PLAIN = _REDUCTIONS | frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type
     broadcast_in_dim cbrt ceil checkpoint clamp closed_call concatenate cond
     convert_element_type copy copy_p cos cosh cummax cumsum custom_jvp_call custom_vjp_call
@@ -262,7 +269,7 @@ _PLAIN = frozenset(
     expm1 floor gather ge gt integer_pow iota is_finite jit largest le le_to linear_map log log1p
     logistic lt lt_to max maybe_set min mul ne neg nextafter nonbatchable nondifferentiable not
     one_minus_square optimization_barrier or pad pjit platform_index polynomial pow reduce_and
-    reduce_max reduce_min reduce_or reduce_prod reduce_sum rem remat remat2 reshape rev round
+    reduce_or rem remat remat2 reshape rev round
     rsqrt scan
     select_and_gather_add select_n shift_left sign sin sinh
     slice smallest split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh

@@ -9,7 +9,7 @@ from jax.extend.core import jaxpr_as_fun
 
 from jaxlag._core import _xla
 from jaxlag._core._jaxprs import equations
-from jaxlag._core._written_out import COLUMNS, TERMS, has_form, written_out
+from jaxlag._core._written_out import COLUMNS, FACTORS, TERMS, has_form, written_out
 
 EPS = np.finfo(float).eps
 
@@ -43,7 +43,11 @@ def scatters(x):
         x[0].at[:, at[:2]].add(x[1, :, :2]),
         x[0].at[at[:2]].set(x[1, :2]),
         (row > 0).at[at[1]].set(True),
+        lax.scatter(jnp.zeros(300), jnp.array([[3], [1]], jnp.int8), row[:2], ALONG),
     )
+
+
+ALONG = lax.ScatterDimensionNumbers((), (0,), (0,))
 
 
 @pytest.mark.parametrize("function", [sums, products, scatters])
@@ -66,10 +70,10 @@ def test_an_index_of_nan_is_that_of_numpy():
         np.testing.assert_array_equal(a, b)
 
 
-def solve(a, b):
-    """With an implicit derivative, as `jnp.linalg.solve` has, by Q and R."""
+def solve(a, b, factor):
+    """factor a^-1 b with an implicit derivative, as `jnp.linalg.solve` has, by Q and R."""
     q, r = jnp.linalg.qr(a)
-    inverse = lambda b: jax.scipy.linalg.solve_triangular(r, q.T @ b)  # noqa: E731
+    inverse = lambda b: factor * jax.scipy.linalg.solve_triangular(r, q.T @ b)  # noqa: E731
     return lax.custom_linear_solve(lambda x: a @ x, b, lambda _, b: inverse(b), lambda _, b: b)
 
 
@@ -130,22 +134,35 @@ def test_triangular_systems_are_solved(lower, trans, unit_diagonal, left):
 
 
 def test_solves_with_implicit_derivatives():
+    """Each has a program of its own."""
     rng = np.random.default_rng(5)
     a = jnp.asarray(rng.normal(size=(4, 4)) + 3.0 * np.eye(4))
-    (x,), names = out_of(solve, a, jnp.arange(4.0))
+
+    def several(a, b):
+        return [solve(a, b, float(k)) for k in range(8)]
+
+    found, names = out_of(several, a, jnp.arange(4.0))
     assert "custom_linear_solve" not in names
-    np.testing.assert_allclose(a @ x, jnp.arange(4.0), rtol=0, atol=64 * EPS)
+    for k, x in enumerate(found):
+        np.testing.assert_allclose(a @ x, k * jnp.arange(4.0), rtol=0, atol=512 * EPS)
 
 
 def test_what_is_large_or_has_no_form_stays():
-    few, many = jnp.ones(TERMS), jnp.ones(TERMS + 1)
+    few, many = jnp.ones(TERMS), jnp.ones(FACTORS + 1)
     wide = jnp.ones((COLUMNS + 1, COLUMNS + 1))
 
     def forms(function, *args):
         return [has_form(eqn) for eqn in equations(jax.make_jaxpr(function)(*args))]
 
-    assert any(forms(jnp.dot, few, few))
+    row, square = jnp.ones(FACTORS), jnp.ones((FACTORS, FACTORS))
+    assert any(forms(jnp.dot, square, row))
     assert not any(forms(jnp.dot, many, many))
+    assert not any(forms(jnp.dot, row > 0, row > 0))
+    assert not any(forms(lax.dot, row.astype(jnp.bfloat16), row.astype(jnp.bfloat16)))
+    assert not any(forms(lambda x: x.at[jnp.array([0])].apply(jnp.exp), row))
+    part = lax.ScatterDimensionNumbers((1,), (0,), (0,))
+    windows = jnp.array([[3], [1]]), jnp.ones((2, 2)), part
+    assert not any(forms(lambda x: lax.scatter_add(x, *windows), square))
     assert not any(forms(jnp.linalg.qr, wide))
     assert not any(forms(jnp.sort, few))
     assert not any(forms(jnp.dot, jnp.ones(0), jnp.ones(0)))
