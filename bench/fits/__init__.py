@@ -12,30 +12,57 @@ interval is valid for noise that is independent between samples. Residuals of dr
 independent: there the intervals are too narrow. `other` is a value for comparison, `whose` its
 source. On test data only the initial states are fitted.
 
-A quick run takes a few windows of each recording.
+A quick run fits three simulated recordings, and one model each of the single pendulum and the
+driven arm, to the data of the whole run. The other parts are left out and named.
 """
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench._harness.timing import Reference, Report
 from bench.fits import _actuated_arm, _cube, _multiarm, _network, _synthetic, _video
 from bench.fits._data import folder
 from bench.fits._report import Part
 
-# Folder of the recordings, and the function of (path, quick) that evaluates them.
-PARTS: tuple[tuple[str, Callable[..., Part]], ...] = (
-    ("multiarm_pendulum", partial(_multiarm.measured, arms=1)),
-    ("multiarm_pendulum", partial(_multiarm.measured, arms=2)),
-    ("multiarm_pendulum", partial(_multiarm.measured, arms=3)),
-    ("multiarm_pendulum", _network.measured),
-    ("dfki_simple_pendulum", _actuated_arm.arm),
-    ("dfki_double_pendulum", partial(_actuated_arm.arms, design="A")),
-    ("dfki_double_pendulum", partial(_actuated_arm.arms, design="C.1")),
-    ("contactnets_cube", _cube.measured),
-    ("ibm_double_pendulum", _video.measured),
+
+class Measured(NamedTuple):
+    """Parts that need one folder of recordings.
+
+    Attributes:
+        recordings: name of the folder.
+        what: name of the part.
+        part: its results, from the path of all recordings.
+        quick: those of a quick run; None for none.
+    """
+
+    recordings: str
+    what: str
+    part: Callable[[Path], Part]
+    quick: Callable[[Path], Part] | None = None
+
+
+PARTS = (
+    Measured(
+        "multiarm_pendulum",
+        "single pendulum",
+        partial(_multiarm.measured, arms=1),
+        partial(_multiarm.tested, arms=1, model=_multiarm.QUICK),
+    ),
+    Measured("multiarm_pendulum", "double pendulum", partial(_multiarm.measured, arms=2)),
+    Measured("multiarm_pendulum", "triple pendulum", partial(_multiarm.measured, arms=3)),
+    Measured("multiarm_pendulum", "neural network", _network.measured),
+    Measured(
+        "dfki_simple_pendulum",
+        "one driven arm",
+        _actuated_arm.arm,
+        partial(_actuated_arm.arm, models=_actuated_arm.QUICK),
+    ),
+    Measured("dfki_double_pendulum", "design A", partial(_actuated_arm.arms, design="A")),
+    Measured("dfki_double_pendulum", "design C.1", partial(_actuated_arm.arms, design="C.1")),
+    Measured("contactnets_cube", "cube in flight", _cube.measured),
+    Measured("ibm_double_pendulum", "video", _video.measured),
 )
 
 
@@ -43,14 +70,18 @@ def run(quick: bool, data: str | None = None) -> Report:
     """All parts, one after the other."""
     path = folder(data)
     found, missing = [_synthetic.part(quick)], []
-    for recordings, part in PARTS:
-        if not (path / recordings).is_dir():
-            missing.append(Reference(recordings, "not in the folder: left out"))
+    for each in PARTS:
+        part = each.quick if quick else each.part
+        if part is None:
+            missing.append(Reference(each.what, "left out of a quick run"))
+            continue
+        if not (path / each.recordings).is_dir():
+            missing.append(Reference(each.recordings, "not in the folder: left out"))
             continue
         try:
-            found.append(part(path=path, quick=quick))
+            found.append(part(path))
         except FileNotFoundError as error:
-            name = f"{recordings}/{Path(error.filename).name}"
+            name = f"{each.recordings}/{Path(error.filename).name}"
             missing.append(Reference(name, "not in the folder: its part is left out"))
     rows: list[dict[str, Any]] = [x._asdict() for part in found for x in part.figures]
     targets = [x for part in found for x in part.targets]

@@ -15,7 +15,7 @@ Two arms, of gear ratio 6, with the inertia Ir of each rotor before the gear:
 A = I1 + m2 l1^2, C = m2 l1 r2, P1 = m1 r1 + m2 l1, P2 = m2 r2, I1 and I2 about the joints.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,12 @@ LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction dissipates energy
 DOCUMENTED = {"J": 0.1485, "ml": 0.305}
 ARM_START = {"J": 0.15, "ml": 0.3, "u0": 0.0, "s": 1.0}
 ARM_START |= {"b": np.array([0.01]), "cf": np.array([0.1])}
+QUICK = ("torque as measured",)
+# Free params and fixed ones.
+MODELS: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
+    "torque as measured": (("J", "ml", "b", "cf", "u0"), {}),
+    "documented masses": (("s", "b", "cf", "u0"), DOCUMENTED),
+}
 
 
 def arm_lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
@@ -123,31 +129,25 @@ def recording(path: Path, columns: tuple[str, ...], torques: tuple[str, ...], ev
     )
 
 
-def arm(path: Path, quick: bool) -> Part:
+def arm(path: Path, models: Sequence[str] = tuple(MODELS)) -> Part:
     """Fit to the run at 500 Hz, test on the run at 50 Hz, in windows of 1 s."""
     name = "one driven arm"
     folder = path / "dfki_simple_pendulum"
     train = windows([recording(folder / "ddp.csv.gz", ("q",), ("tau_meas",), EVERY)], 1.0)
     test = windows([recording(folder / "ilqr.csv.gz", ("q",), ("tau_meas",), 1)], 1.0)
-    if quick:
-        train, test = train[:2], test[:2]
     figures = []
-    for model, free, fixed in (
-        ("torque as measured", ("J", "ml", "b", "cf", "u0"), {}),
-        ("documented masses", ("s", "b", "cf", "u0"), DOCUMENTED),
-    ):
+    for model in models:
+        free, fixed = MODELS[model]
         losses = dict.fromkeys(("b", "cf"), LOSS)
-        fit = partial(jl.fit, ARM, train, ARM_START | fixed, free=free, transforms=losses)
+        fit = partial(jl.fit, ARM, train, {**ARM_START, **fixed}, free=free, transforms=losses)
         found, cost = timed(name, model, partial(fit, **OPTIONS))
         figures += cost + estimates(name, model, found, DOCUMENTED, "documented")
         figures += errors(name, model, "rms of training, 1 s", found.rms("q"))
         figures += errors(name, model, "rms of test, 1 s", missed(found.predict(test), "q"))
-        if quick:
-            break
     return Part(figures, [], [])
 
 
-def arms(path: Path, design: str, quick: bool) -> Part:
+def arms(path: Path, design: str) -> Part:
     """Fit and test in windows of 0.5 s."""
     name = f"two driven arms, design {design}"
     folder = path / "dfki_double_pendulum"
@@ -155,9 +155,7 @@ def arms(path: Path, design: str, quick: bool) -> Part:
 
     def read(which: str) -> list[jl.Experiment]:
         files = [folder / f"design{run}.csv.gz" for run in DESIGNS[design][which]]
-        files = files[:1] if quick else files
-        found = windows([recording(file, angles, torques, EVERY) for file in files], 0.5)
-        return found[:4] if quick else found
+        return windows([recording(file, angles, torques, EVERY) for file in files], 0.5)
 
     train, test = read("train"), read("test")
     theirs = published(design)

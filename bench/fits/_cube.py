@@ -93,13 +93,11 @@ def tosses(path: Path) -> list[jl.Experiment]:
     return found
 
 
-def measured(path: Path, quick: bool) -> Part:
+def measured(path: Path) -> Part:
     """g and the ratios, and the errors of predicted flights."""
     name, model = "cube in flight", "free body"
     all_of_them = tosses(path)
     train, test = all_of_them[:TRAINING], all_of_them[TRAINING:]
-    if quick:
-        train, test = train[:4], test[:2]
 
     def fit() -> jl.FitResult:
         return jl.fit(CUBE, train, START, free=tuple(START), **OPTIONS)

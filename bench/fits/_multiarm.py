@@ -33,6 +33,7 @@ PIECES = 4  # segments of multiple shooting, for recordings of one arm
 OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}}
 SLIP = 0.05  # rad/s, width of the sign change of dry friction
 ANGLE = 0.05  # rad, width of the sign change of the restoring moment
+QUICK = "viscous, falling, drag, restoring"  # the friction model of one arm in a quick run
 # Errors of a fit to all segments, mrad, for comparison (single: whole segments; else 1 s).
 REFITTED = {1: (2.05,), 2: (1.1, 1.5), 3: (1.2, 1.2, 1.1)}
 MARGIN = 1.1
@@ -161,33 +162,26 @@ def recordings(path: Path, arms: int, every: int) -> dict[int, jl.Experiment]:
     return found
 
 
-def measured(path: Path, arms: int, quick: bool) -> Part:
-    """All results for one pendulum."""
-    recording = f"{NAMES[arms]} pendulum"
+def measured(path: Path, arms: int) -> Part:
+    """The choice of a friction model, its fit, and the errors of its predictions."""
+    train, test = _divided(path, arms)
+    best, figures = _chosen(arms, train)
+    found, part = _tested(arms, best.name, best.fit.params, train, test)
+    figures += part.figures + _ahead(path, arms, best.name, found)
+    return Part(figures, part.targets, _unidentifiable(arms, train))
+
+
+def tested(path: Path, arms: int, model: str) -> Part:
+    """The fit of one of the friction models, and the errors of its predictions."""
+    params0 = _frictionless(arms) | candidates(arms)[model].params0
+    return _tested(arms, model, params0, *_divided(path, arms))[1]
+
+
+def _divided(path: Path, arms: int) -> tuple[list[jl.Experiment], list[jl.Experiment]]:
+    """(segments for training, segments for the test)."""
     segments = recordings(path, arms, EVERY)
     train = [x for number, x in segments.items() if number % 3]
-    test = [x for number, x in segments.items() if number % 3 == 0]
-    if quick:
-        train, test = train[:6], test[:2]
-    chosen, fit, figures = _chosen(recording, arms, train, quick)
-    found, cost = timed(recording, chosen, fit)
-    figures += cost + estimates(recording, chosen, found, base(arms), "published")
-    figures += errors(recording, chosen, "rms of training", found.rms("theta"))
-    lengths = (
-        {"9.17 s": test, "1 s": windows(test, 1.0)} if arms == 1 else {"1 s": windows(test, 1.0)}
-    )
-    shown = {x: missed(found.predict(data), "theta") for x, data in lengths.items()}
-    length, best = next(iter(shown.items()))
-    refitted = {length: (REFITTED[arms], "refitted to all")}
-    for x, rms in shown.items():
-        figures += errors(recording, chosen, f"rms of test, {x}", rms, *refitted.get(x, ()))
-    claims = [f"mrad: rms of test, {length}, angle {i + 1} of the {recording}" for i in range(arms)]
-    targets = [
-        Target(claim, 1e3 * float(own), "<=", MARGIN * other)
-        for claim, own, other in zip(claims, best, REFITTED[arms], strict=True)
-    ]
-    figures += _ahead(path, arms, recording, chosen, found, quick)
-    return Part(figures, targets, _unidentifiable(fitted(train, arms), arms, recording, quick))
+    return train, [x for number, x in segments.items() if number % 3 == 0]
 
 
 def fitted(segments: list[jl.Experiment], arms: int) -> list[jl.Experiment]:
@@ -195,22 +189,38 @@ def fitted(segments: list[jl.Experiment], arms: int) -> list[jl.Experiment]:
     return segments if arms == 1 else windows(segments, 1.0)
 
 
-def _chosen(
-    recording: str, arms: int, train: list[jl.Experiment], quick: bool
-) -> tuple[str, Callable[[], jl.FitResult], list[Figure]]:
-    """(friction model with the best predictions, its fit to all segments, errors of all models)."""
-    system = jl.System(lagrangian, {"theta": (arms,)})
-    params0 = base(arms) | {"zero": np.zeros(arms)}
-    models = candidates(arms)
-    if quick:
-        models = dict(list(models.items())[:2])
+def _name(arms: int) -> str:
+    return f"{NAMES[arms]} pendulum"
+
+
+def _system(arms: int) -> jl.System:
+    return jl.System(lagrangian, {"theta": (arms,)})
+
+
+def _frictionless(arms: int) -> dict[str, Any]:
+    """Initial values without those of friction."""
+    return base(arms) | {"zero": np.zeros(arms)}
+
+
+def _options(arms: int) -> dict[str, Any]:
+    # Single shooting over whole recordings of one arm ends in local minima.
+    return {"segments": PIECES if arms == 1 else 1} | OPTIONS
+
+
+def _chosen(arms: int, train: list[jl.Experiment]) -> tuple[Any, list[Figure]]:
+    """(friction model with the best predictions, fitted to a part; errors of all models)."""
+    recording, params0 = _name(arms), _frictionless(arms)
     held_out = fitted(train[1::3], arms)
     rest = fitted([x for i, x in enumerate(train) if i % 3 != 1], arms)
-    # Single shooting over whole recordings of one arm ends in local minima.
-    options, free = {"segments": PIECES if arms == 1 else 1} | OPTIONS, tuple(params0)
     begun = perf_counter()
     compared = jl.select_model(
-        system, rest, params0, models, held_out=held_out, free=free, fit_options=options
+        _system(arms),
+        rest,
+        params0,
+        candidates(arms),
+        held_out=held_out,
+        free=tuple(params0),
+        fit_options=_options(arms),
     )
     spent = perf_counter() - begun
     figures = []
@@ -222,15 +232,36 @@ def _chosen(
         Figure(recording, "all of them", "run time of the comparison", "s", spent),
         Figure(recording, "all of them", "motions with derivatives", "1", solves),
     ]
-    best, term = compared.best, models.get(compared.best.name)
+    return compared.best, figures
+
+
+def _tested(
+    arms: int, model: str, params0: Any, train: list[jl.Experiment], test: list[jl.Experiment]
+) -> tuple[jl.FitResult, Part]:
+    """(fit to all segments for training, its estimates and errors)."""
+    recording, system, free = _name(arms), _system(arms), tuple(_frictionless(arms))
+    options, term = _options(arms), candidates(arms).get(model)  # None: without friction
     if term is not None:
         system = system.with_forces(*term.forces)
-        free, options = (*params0, *term.params0), options | {"transforms": term.transforms}
-    return (
-        best.name,
-        partial(jl.fit, system, fitted(train, arms), best.fit.params, free=free, **options),
-        figures,
+        free, options = (*free, *term.params0), options | {"transforms": term.transforms}
+    fit = partial(jl.fit, system, fitted(train, arms), params0, free=free, **options)
+    found, figures = timed(recording, model, fit)
+    figures += estimates(recording, model, found, base(arms), "published")
+    figures += errors(recording, model, "rms of training", found.rms("theta"))
+    lengths = (
+        {"9.17 s": test, "1 s": windows(test, 1.0)} if arms == 1 else {"1 s": windows(test, 1.0)}
     )
+    shown = {x: missed(found.predict(data), "theta") for x, data in lengths.items()}
+    length, best = next(iter(shown.items()))
+    refitted = {length: (REFITTED[arms], "refitted to all")}
+    for x, rms in shown.items():
+        figures += errors(recording, model, f"rms of test, {x}", rms, *refitted.get(x, ()))
+    claims = [f"mrad: rms of test, {length}, angle {i + 1} of the {recording}" for i in range(arms)]
+    targets = [
+        Target(claim, 1e3 * float(own), "<=", MARGIN * other)
+        for claim, own, other in zip(claims, best, REFITTED[arms], strict=True)
+    ]
+    return found, Part(figures, targets, [])
 
 
 def _published(arms: int) -> jl.System:
@@ -238,17 +269,15 @@ def _published(arms: int) -> jl.System:
     return jl.System(published_lagrangian, {"theta": (arms,)}, forces=(friction,))
 
 
-def _ahead(
-    path: Path, arms: int, recording: str, chosen: str, found: jl.FitResult, quick: bool
-) -> list[Figure]:
+def _ahead(path: Path, arms: int, model: str, found: jl.FitResult) -> list[Figure]:
     """Predictions 1 s ahead of starts fitted to 0.1 s, compared with published params."""
     finer = recordings(path, arms, EVERY_EARLY)
-    test = windows([x for n, x in finer.items() if n % 3 == 0][: 2 if quick else None], 1.1)
+    test = windows([x for n, x in finer.items() if n % 3 == 0], 1.1)
     own = found.predict(test, settle=SETTLE)
     theirs = jl.predict(_published(arms), test, PUBLISHED[arms], settle=SETTLE, **OPTIONS)
     return errors(
-        recording,
-        chosen,
+        _name(arms),
+        model,
         "rms 1 s ahead of 0.1 s",
         missed(own, "theta"),
         1e3 * missed(theirs, "theta"),
@@ -256,15 +285,11 @@ def _ahead(
     )
 
 
-def _unidentifiable(
-    train: list[jl.Experiment], arms: int, recording: str, quick: bool
-) -> list[Reference]:
+def _unidentifiable(arms: int, train: list[jl.Experiment]) -> list[Reference]:
     """Null directions of the model with masses, lever arms and inertias."""
     params = PUBLISHED[arms]
-    found = jl.fit(
-        _published(arms), train[:2] if quick else train, params, free=tuple(params), **OPTIONS
-    )
-    head = f"{recording}, {len(params)} params"
+    found = jl.fit(_published(arms), fitted(train, arms), params, free=tuple(params), **OPTIONS)
+    head = f"{_name(arms)}, {len(params)} params"
     return [Reference(head, f"unknown: {text}") for text in found.unidentifiable] + [
         Reference(head, f"known: {text}") for text in found.determined
     ]

@@ -25,7 +25,7 @@ PHYSICS = multiarm.candidates(1)["viscous, falling, drag"]
 EVERY = 20  # ms
 WIDTH = 8
 SHARP = 3.0  # scale of the network's inputs: the potential may change within a third of a radian
-EPOCHS, QUICK_EPOCHS = 300, 5
+EPOCHS = 300
 MEMORY = 20
 COORDINATES = {"theta": (1,)}
 
@@ -45,14 +45,12 @@ def drift(params: Any) -> float:
     return float(np.max(np.abs(energy - energy[0])) / np.abs(params["G1"]))
 
 
-def measured(path: Path, quick: bool) -> Part:
+def measured(path: Path) -> Part:
     """Both models, tested on segments that were not used for training."""
     name, model = "single pendulum", "physics and a network's potential"
     segments = multiarm.recordings(path, 1, EVERY)
     train = [x for number, x in segments.items() if number % 3]
     test = [x for number, x in segments.items() if number % 3 == 0]
-    if quick:
-        train, test = train[:1], test[:1]
     params0 = multiarm.base(1) | {"zero": np.zeros(1)} | PHYSICS.params0
     free, options = tuple(params0), {"transforms": PHYSICS.transforms} | multiarm.OPTIONS
     plain = jl.System(multiarm.lagrangian, COORDINATES, forces=PHYSICS.forces)
@@ -61,8 +59,7 @@ def measured(path: Path, quick: bool) -> Part:
     key = jax.random.key(0)
     network = eqx.nn.MLP(2, "scalar", WIDTH, 1, jnp.tanh, use_final_bias=False, key=key)
     both = jl.System(learned, COORDINATES, forces=PHYSICS.forces)
-    epochs = QUICK_EPOCHS if quick else EPOCHS
-    descent = jl.Descent(optax.lbfgs(memory_size=MEMORY), epochs=epochs, batch=len(train))
+    descent = jl.Descent(optax.lbfgs(memory_size=MEMORY), epochs=EPOCHS, batch=len(train))
 
     def fit() -> jl.FitResult:
         start = physics.params | {"net": network}

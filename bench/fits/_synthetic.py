@@ -29,6 +29,7 @@ from jaxlag._fit._setup import build_shooting, readers_of
 TRUE = {"l1": 1.0, "l2": 0.8, "m2": 0.7, "m1": 1.0, "g": 9.81}
 FREE = ("l1", "l2", "m2")
 NOISE = 5e-3  # rad
+NAME = "simulated double pendulum"
 RATE = 100.0  # 1/s
 START = np.array([2.0, 2.6])  # rad, at rest
 TIMES = 5.0  # Lyapunov times
@@ -167,38 +168,41 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
 
 
 def part(quick: bool) -> Part:
-    """Recovery of the params, and coverage of the intervals."""
-    name = "simulated double pendulum"
-    exponent = float(lyapunov_exponent())
-    ts = times(exponent)
-    seeds, fits = (3, 20) if quick else (100, 1000)
+    """Recovery of the params; without segments and with coverage unless `quick`."""
+    ts = times(exponent := float(lyapunov_exponent()))
     figures = [
-        Figure(name, "", "largest Lyapunov exponent", "1/s", exponent),
-        Figure(name, "", "horizon", "s", float(ts[-1])),
+        Figure(NAME, "", "largest Lyapunov exponent", "1/s", exponent),
+        Figure(NAME, "", "horizon", "s", float(ts[-1])),
     ]
-    targets = []
-    for model, segments in ((f"{SEGMENTS} segments", SEGMENTS), ("single shooting", 1)):
-        tally = recovered(ts, seeds, segments)
-        figures += [
-            Figure(
-                name,
-                model,
-                f"of {seeds}: within 1 % and the 99 % interval",
-                "1",
-                float(tally.found),
-            ),
-            Figure(name, model, f"of {seeds}: within 1 %", "1", float(tally.near)),
-            Figure(name, model, "largest error of those", "1", tally.worst),
-            Figure(name, model, "motions with derivatives, median", "1", tally.solves),
-        ]
-        if segments > 1:
-            claim = f"% of {seeds} starts wrong by half that end within 1 % and the 99 % interval"
-            targets.append(Target(claim, 100.0 * tally.found / seeds, ">=", 95.0))
+    noise = Reference(f"{1e3 * NOISE:g} mrad at {RATE:g} Hz", f"noise of the {NAME}")
+    if quick:
+        parts = [_recovery(ts, 3, SEGMENTS)]
+    else:
+        parts = [_recovery(ts, 100, SEGMENTS), _recovery(ts, 100, 1), _covered(ts, 1000)]
+    figures += [x for each in parts for x in each.figures]
+    return Part(figures, [x for each in parts for x in each.targets], [noise])
+
+
+def _recovery(ts: np.ndarray, seeds: int, segments: int) -> Part:
+    tally = recovered(ts, seeds, segments)
+    values = {
+        f"of {seeds}: within 1 % and the 99 % interval": float(tally.found),
+        f"of {seeds}: within 1 %": float(tally.near),
+        "largest error of those": tally.worst,
+        "motions with derivatives, median": tally.solves,
+    }
+    model = f"{segments} segments" if segments > 1 else "single shooting"
+    figures = [Figure(NAME, model, what, "1", value) for what, value in values.items()]
+    claim = f"% of {seeds} starts wrong by half that end within 1 % and the 99 % interval"
+    target = Target(claim, 100.0 * tally.found / seeds, ">=", 95.0)
+    return Part(figures, [target] if segments > 1 else [], [])
+
+
+def _covered(ts: np.ndarray, fits: int) -> Part:
+    figures, targets, model = [], [], f"{SEGMENTS} segments, from the truth"
     for param, share in zip(FREE, coverage(ts, fits).tolist(), strict=True):
-        model = f"{SEGMENTS} segments, from the truth"
-        figures.append(Figure(name, model, f"coverage of 95 %, {param}", "1", share))
-        for relation, bound in ((">=", 93.0), ("<=", 97.0)):
-            claim = f"% of {fits} intervals of 95 % hold {param}"
-            targets.append(Target(claim, 100.0 * share, relation, bound))
-    noise = Reference(f"{1e3 * NOISE:g} mrad at {RATE:g} Hz", f"noise of the {name}")
-    return Part(figures, targets, [noise])
+        figures.append(Figure(NAME, model, f"coverage of 95 %, {param}", "1", share))
+        claim = f"% of {fits} intervals of 95 % hold {param}"
+        targets += [Target(claim, 100.0 * share, ">=", 93.0)]
+        targets += [Target(claim, 100.0 * share, "<=", 97.0)]
+    return Part(figures, targets, [])

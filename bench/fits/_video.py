@@ -53,12 +53,10 @@ def angles(path: Path, run: str) -> jl.Experiment:
     return jl.Experiment(np.arange(len(theta)) / RATE, {"theta": theta}, name=f"run {run}")
 
 
-def measured(path: Path, quick: bool) -> Part:
+def measured(path: Path) -> Part:
     """Fit two runs, test on a third."""
     name, model = "double pendulum on video", "viscous"
     train, test = (windows([angles(path, run) for run in runs], WINDOW) for runs in (TRAIN, TEST))
-    if quick:
-        train, test = train[::40], test[::40]
 
     def fit() -> jl.FitResult:
         transforms = dict.fromkeys(("k1", "k2"), jl.transforms.Bounded(0.0, np.inf))

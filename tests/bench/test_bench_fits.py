@@ -74,17 +74,33 @@ def test_command_names_a_missing_folder(tmp_path, capsys):
     assert "--data must name a folder" in capsys.readouterr().err
 
 
-def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):
+def without_simulation(monkeypatch):
     monkeypatch.setattr(synthetic, "part", lambda quick: Part(errors("a", "b", "c", [1.0]), [], []))
-    report = fits.run(quick=True, data=str(tmp_path))
+
+
+def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):
+    without_simulation(monkeypatch)
+    report = fits.run(quick=False, data=str(tmp_path))
     assert len(report.rows) == 1
     named = {reference.figure for reference in report.references}
-    assert named == {recordings for recordings, _ in fits.PARTS}
+    assert named == {each.recordings for each in fits.PARTS}
     (tmp_path / "multiarm_pendulum").mkdir()
-    named = [reference.figure for reference in fits.run(quick=True, data=str(tmp_path)).references]
+    named = [reference.figure for reference in fits.run(quick=False, data=str(tmp_path)).references]
     files = {f"multiarm_pendulum/{name}.csv.gz" for name in ("single", "double", "triple")}
     assert files <= set(named)
     assert "multiarm_pendulum" not in named
+
+
+def test_a_quick_run_names_the_parts_that_it_leaves_out(tmp_path, monkeypatch):
+    without_simulation(monkeypatch)
+    report = fits.run(quick=True, data=str(tmp_path))
+    short = [each for each in fits.PARTS if each.quick is not None]
+    long = [each for each in fits.PARTS if each.quick is None]
+    assert short
+    assert long
+    expected = {(each.what, "left out of a quick run") for each in long}
+    expected |= {(each.recordings, "not in the folder: left out") for each in short}
+    assert set(report.references) == expected
 
 
 def test_angles_of_a_video_are_relative_to_gravity(tmp_path):
