@@ -6,9 +6,9 @@ that of the body. The rule of a primitive is kept.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import update_wrapper
+from functools import partial, update_wrapper
 from typing import Any
 
 import jax
@@ -19,8 +19,8 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from jaxlag._core._jaxprs import rewritten
+from jaxlag._core._tangents import Leaves, derivative, from_jax, is_constant, to_jax
 
-Leaves = Sequence[Any]
 NAME = "custom_jvp_call"
 
 
@@ -95,7 +95,7 @@ class _Flat(AbstractRule):
         leaves, tree = jax.tree.flatten(results)
         if result_dots is None:
             return leaves, [None] * len(leaves)
-        return leaves, [None if _is_float0(x) else x for x in tree.flatten_up_to(result_dots)]
+        return leaves, [None if is_constant(x) else x for x in tree.flatten_up_to(result_dots)]
 
     @property
     def key(self) -> Any:
@@ -113,21 +113,11 @@ class _Users(AbstractRule):
     eqn: Any
 
     def __call__(self, primals: Leaves, dots: Leaves) -> tuple[Leaves, Leaves]:
-        moving = [i for i, dot in enumerate(dots) if dot is not None]
+        def call(*args: Any) -> list:
+            params = self.eqn.primitive.get_bind_params(self.eqn.params)
+            return self.eqn.primitive.bind(*args, **params)
 
-        def both(primals: list, moved: list) -> tuple[Any, Any]:
-            def along(*moving_ones: Any) -> Any:
-                args = list(primals)
-                for i, x in zip(moving, moving_ones, strict=True):
-                    args[i] = x
-                params = self.eqn.primitive.get_bind_params(self.eqn.params)
-                return self.eqn.primitive.bind(*args, **params)
-
-            results, found = jax.jvp(along, [primals[i] for i in moving], moved)
-            return results, [None if _is_float0(x) else x for x in found]
-
-        given = list(primals), [dots[i] for i in moving]
-        return keeping_rules(both)(*given)
+        return keeping_rules(partial(derivative, call))(list(primals), list(dots))
 
     @property
     def key(self) -> Any:
@@ -192,10 +182,6 @@ def _zero(x: Any) -> Any:
     return np.zeros(jnp.shape(x), jax.dtypes.float0)
 
 
-def _is_float0(x: Any) -> bool:
-    return getattr(x, "dtype", None) == jax.dtypes.float0
-
-
 _custom_jvp = Primitive(NAME)
 _custom_jvp.multiple_results = True
 
@@ -227,14 +213,8 @@ def _derivative(
     primals: Leaves, tangents: Leaves, *, call_jaxpr: ClosedJaxpr, rule: AbstractRule
 ) -> tuple[list, list]:
     del call_jaxpr
-    dots = [None if type(dot) is ad.Zero else dot for dot in tangents]
-    results, found = rule(list(map(jnp.asarray, primals)), dots)
-    pairs = zip(results, found, strict=True)
-    return list(results), [_no_tangent(x) if d is None else d for x, d in pairs]
-
-
-def _no_tangent(x: Any) -> ad.Zero:
-    return ad.Zero(jax.typeof(x).to_tangent_aval())
+    results, found = rule(list(map(jnp.asarray, primals)), from_jax(tangents))
+    return list(results), to_jax(results, found)
 
 
 ad.primitive_jvps[_custom_jvp] = _derivative

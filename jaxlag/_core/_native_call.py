@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 
 from jaxlag._core import _xla
 from jaxlag._core._jaxprs import equations
+from jaxlag._core._tangents import derivative, from_jax, to_jax
 from jaxlag._core._written_out import has_form, written_out
 
 _native_call = Primitive("native_call")
@@ -104,18 +105,8 @@ mlir.register_lowering(_native_call, mlir.lower_fun(_on_cpu, multiple_results=Tr
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, program: ClosedJaxpr) -> tuple:
-    moving = [i for i, dot in enumerate(tangents) if type(dot) is not ad.Zero]
-
-    def along(*moved: Any) -> list:
-        args = list(primals)
-        for i, x in zip(moving, moved, strict=True):
-            args[i] = x
-        return jaxpr_as_fun(program)(*args)
-
-    found, dots = jax.jvp(along, [primals[i] for i in moving], [tangents[i] for i in moving])
-    kinds: list[Any] = [jax.typeof(x).to_tangent_aval() for x in found]
-    pairs = zip(dots, kinds, strict=True)
-    return found, [ad.Zero(k) if k.dtype == jax.dtypes.float0 else dot for dot, k in pairs]
+    found, dots = derivative(jaxpr_as_fun(program), primals, from_jax(tangents))
+    return found, to_jax(found, dots)
 
 
 ad.primitive_jvps[_native_call] = _jvp
