@@ -84,7 +84,7 @@ def _total(x: Array) -> Array:
 
 def _reduced(combine: Callable) -> Callable:
     def function(params: Any, x: Array) -> Array:
-        for axis in sorted(params["axes"], reverse=True):
+        for axis in sorted(map(int, params["axes"]), reverse=True):
             x = reduce(combine, _parts(x, axis))
         return x
 
@@ -96,7 +96,7 @@ def _index_of(is_better: Callable) -> Callable:
 
     def function(params: Any, x: Array) -> Array:
         (axis,), kind = params["axes"], params["index_dtype"]
-        best, *others = _parts(x.astype(jnp.int32) if x.dtype == bool else x, axis)
+        best, *others = _parts(x.astype(jnp.int32) if x.dtype == bool else x, int(axis))
         index = jnp.zeros(best.shape, kind)
         for k, other in enumerate(others, 1):
             better = is_better(other, best) | ((other != other) & (best == best))

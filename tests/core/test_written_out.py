@@ -24,7 +24,8 @@ def out_of(function, *args):
 
 def sums(x):
     parts = jnp.sum(x, (0, 2)), jnp.prod(x, 1), jnp.max(x, 2), jnp.min(x, (0, 1))
-    return parts, jnp.any(x > 0, 0), jnp.all(x > -1.0, (1, 2)), jnp.argmax(x, 1), jnp.argmin(x, 2)
+    best = jnp.argmax(x, 1), jnp.argmin(x, 2), lax.argmax(x, np.int64(1), jnp.int32)
+    return parts, jnp.any(x > 0, 0), jnp.all(x > -1.0, (1, 2)), best
 
 
 def products(x):

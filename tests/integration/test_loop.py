@@ -80,8 +80,14 @@ def step_ends(options):
     from jaxlag._simulation import _simulate
 
     caught = []
+
+    def catch(plan, values):
+        caught.append((plan, values))
+        raise StopIteration
+
+    catch.programs = lambda: 0
     original = _simulate._simulate
-    _simulate._simulate = lambda plan, values: caught.append((plan, values)) or _stop()
+    _simulate._simulate = catch
     try:
         run(np.array([0.0, 4.0]), **options)
     except StopIteration:
@@ -100,10 +106,6 @@ def step_ends(options):
     # offset.
     ends = np.asarray(recorded.offsets)[: int(recorded.steps)]
     return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
-
-
-def _stop():
-    raise StopIteration
 
 
 @pytest.mark.full
