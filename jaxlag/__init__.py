@@ -66,6 +66,10 @@ from jaxlag._statics._equilibrium import Equilibrium as Equilibrium
 from jaxlag._statics._equilibrium import equilibrium as equilibrium
 from jaxlag._statics._inverse_dynamics import inverse_dynamics as inverse_dynamics
 from jaxlag._statics._inverse_dynamics import prescribed_motion as prescribed_motion
+from jaxlag._sweep._case import Case as Case
+from jaxlag._sweep._replay import replay as replay
+from jaxlag._sweep._sweep import sweep as sweep
+from jaxlag._sweep._sweep_result import SweepResult as SweepResult
 from jaxlag._system._system import System as System
 
 __version__ = _version("jaxlag")

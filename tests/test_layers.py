@@ -1,6 +1,6 @@
 """Which package may import which, by the syntax tree: includes late imports and those for types.
 
-The order is model -> lowering -> system -> integration -> gradient -> simulation -> fit.
+The order is model -> lowering -> system -> integration -> gradient -> simulation -> fit, sweep.
 """
 
 import ast
@@ -41,6 +41,7 @@ ALLOWED = {
     "_simulation": (*_TO_SYSTEM, "_statics", "_integration", "_gradient"),
     "_analysis": (*_TO_SYSTEM, "_statics", "_simulation"),
     "_fit": ("_core", "_tracing", "_model", "_system", "_simulation"),
+    "_sweep": ("_core", "_tracing", "_model", "_system", "_simulation"),
     "transforms": ("_fit",),
 }
 WITHIN_LOWERING = {

@@ -23,7 +23,7 @@ from jaxlag._core._result import AbstractResult
 from jaxlag._linalg._mass_solve import dependence_floor
 from jaxlag._model._inputs import check_inputs
 from jaxlag._model._states import check_no_states, named_states
-from jaxlag._simulation._option_checks import check_start, check_states_start, check_times
+from jaxlag._simulation._options._option_checks import check_start, check_states_start, check_times
 from jaxlag._simulation._simulate import simulate
 from jaxlag._simulation._solution import Solution
 from jaxlag._system._system import System

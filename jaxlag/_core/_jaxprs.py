@@ -89,6 +89,18 @@ def rewritten(
     return ClosedJaxpr(jaxpr, consts)
 
 
+def constants(program: ClosedJaxpr) -> list[Any]:
+    """All constants of a program and of those nested in it."""
+    found: list[Any] = []
+
+    def seen(x: Any) -> Any:
+        found.append(x)
+        return x
+
+    rewritten(program, lambda eqn: eqn, seen)
+    return found
+
+
 def _inside(jaxpr: Any, *change: Callable) -> Any:
     eqns = [_equation(eqn, *change) for eqn in jaxpr.eqns]
     same = all(new is old for new, old in zip(eqns, jaxpr.eqns, strict=True))

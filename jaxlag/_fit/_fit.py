@@ -28,17 +28,17 @@ from jaxlag._fit._residuals import LOSSES, Reader, squares
 from jaxlag._fit._segments import SegmentLayout, layout
 from jaxlag._fit._setup import (
     FORMER,
-    NO_OPTIONS,
+    OURS,
     build_shooting,
     check_known_params,
     check_search,
     estimated_noise,
     experiments_of,
-    plain_options,
     readers_of,
     with_noise,
 )
 from jaxlag._simulation._jump_times import Jump, Jumps, names_of, warn
+from jaxlag._simulation._options._simulate_options import NO_OPTIONS, plain_options
 from jaxlag._system._system import System
 from jaxlag._tracing._params import check_keys
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -148,7 +148,7 @@ def fit(
     experiments = experiments_of(experiments)
     _check(system, segments, loss, optimizer)
     check_search(rtol, atol, max_steps)
-    options = plain_options(simulate_options, "jl.fit")
+    options = plain_options(simulate_options, "jl.fit", OURS)
     own = by_name("channels", channels, "lambda motion: motion['theta']")
     check_known_params("fit", system, experiments, "params0", params0)
     transforms = by_name("transforms", transforms, "jl.transforms.Positive()")

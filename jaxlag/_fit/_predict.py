@@ -21,14 +21,14 @@ from jaxlag._fit._residuals import Reader, channels_of, rms_of, squares
 from jaxlag._fit._segments import SegmentLayout, layout
 from jaxlag._fit._setup import (
     FORMER,
-    NO_OPTIONS,
+    OURS,
     build_shooting,
     check_known_params,
     check_search,
     experiments_of,
-    plain_options,
     readers_of,
 )
+from jaxlag._simulation._options._simulate_options import NO_OPTIONS, plain_options
 from jaxlag._system._system import System
 from jaxlag._tracing._params import check_keys
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -132,7 +132,7 @@ def predict(
         0.000 0.031
     """
     experiments = experiments_of(experiments)
-    options = plain_options(simulate_options, "jl.predict")
+    options = plain_options(simulate_options, "jl.predict", OURS)
     check_search(rtol, atol, max_steps)
     own = by_name("channels", channels, "lambda motion: motion['theta']")
     check_known_params("predict", system, experiments, "params", params)

@@ -17,9 +17,10 @@ from jaxlag._fit._fit import fit
 from jaxlag._fit._fit_result import FitResult
 from jaxlag._fit._free_parameters import Prior
 from jaxlag._fit._predict import Prediction
-from jaxlag._fit._setup import FORMER, NO_OPTIONS, experiments_of, spreads
+from jaxlag._fit._setup import FORMER, experiments_of, spreads
 from jaxlag._fit._transforms import AbstractTransform
 from jaxlag._model._forces import AbstractForce
+from jaxlag._simulation._options._simulate_options import NO_OPTIONS
 from jaxlag._system._system import System
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
 from statistics import NormalDist
-from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -51,10 +50,6 @@ def experiments_of(given: Any) -> tuple[Experiment, ...]:
     return found
 
 
-NO_OPTIONS: Mapping[str, Any] = MappingProxyType({})
-"""No options of `simulate`."""
-
-
 FORMER = {
     "tolerance": "rtol= and atol=",
     "max_iterations": "max_steps=",
@@ -95,33 +90,6 @@ def check_known_params(
     check_keys(params, argument)
     inputs = experiments[0].inputs_at(params)
     check_params(system, params, jnp.zeros(system.size), inputs, argument)
-
-
-def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
-    """Options of `jl.simulate` for the key of compiled programs, numbers as Python's.
-
-    Raises:
-        ValueError: an option unknown to `simulate`, one that the caller sets, or one with an
-            array.
-    """
-    if not isinstance(options, Mapping):
-        must, was = "be a dict of options of jl.simulate", f"it was {options!r}"
-        raise invalid("simulate_options", must, was)
-    known = signature(simulate).parameters
-    found = {}
-    for name, value in options.items():
-        if name not in known or name == "system":
-            names = [key for key in known if key not in (*OURS, "system")]
-            raise invalid("simulate_options", f"be among {names}", f"one was {name!r}")
-        if name in OURS:
-            raise invalid(name, f"be left out, since {by} sets it", "it was given")
-        if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
-            if np.ndim(value):
-                must, was = "be one number, a name or an object without arrays", f"it was {value!r}"
-                raise invalid(name, must, was)
-            value = value.item()
-        found[name] = value
-    return found
 
 
 def readers_of(

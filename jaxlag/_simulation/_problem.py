@@ -30,8 +30,8 @@ from jaxlag._integration._vector_field import VectorField
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, common_range, knots_increase
 from jaxlag._model._states import named_states
-from jaxlag._simulation._method_requirements import check_requirements, splits
 from jaxlag._simulation._methods import for_state, solver_named
+from jaxlag._simulation._options._method_requirements import check_requirements, splits
 from jaxlag._statics._assemble import assembled
 from jaxlag._system._inspection import check_declaration
 from jaxlag._system._system import System

@@ -28,7 +28,7 @@ from jaxlag._simulation._error_estimate import LEFT, check_estimate, finer, with
 from jaxlag._simulation._failure import final_status
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import FINER, IMPLICIT, METHODS, choose, name_of, of_structure
-from jaxlag._simulation._option_checks import (
+from jaxlag._simulation._options._option_checks import (
     check_change_points,
     check_formulation,
     check_longest,

@@ -1,6 +1,7 @@
 """Views of a solution: as text, as a dict, as a dataset, as a figure."""
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -77,37 +78,60 @@ def columns(motion: AbstractSolution) -> dict[str, Any]:
     return found
 
 
-def as_dict(motion: AbstractSolution) -> dict[str, np.ndarray]:
-    """See `Solution.to_dict`."""
-    saved = {
+def flat_quantities(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Quantities by name; of a quantity that is a dict, by its name and the key."""
+    return {
         f"{name} {key}".strip(): value
-        for name, part in motion.saved.items()
+        for name, part in saved.items()
         for key, value in (part.items() if isinstance(part, dict) else [("", part)])
     }
-    found = {"t": motion.ts} | columns(motion) | saved
+
+
+def as_dict(motion: AbstractSolution) -> dict[str, np.ndarray]:
+    """See `Solution.to_dict`."""
+    found = {"t": motion.ts} | columns(motion) | flat_quantities(motion.saved)
     return {name: np.asarray(value) for name, value in found.items()}
 
 
 def as_dataset(motion: AbstractSolution) -> Any:
     """See `Solution.to_xarray`."""
+    found = columns(motion) | flat_quantities(motion.saved)
+    values = {name: np.asarray(value) for name, value in found.items()}
+    return dataset(np.asarray(motion.ts), values, {"status": np.asarray(motion.status)})
+
+
+def dataset(
+    ts: np.ndarray, values: Mapping[str, np.ndarray], facts: Mapping[str, np.ndarray]
+) -> Any:
+    """A dataset of one motion or a batch of them.
+
+    Args:
+        ts: (..., s), s.
+        values: of each at these times, (..., s, ...), by name.
+        facts: of each, (...), by name.
+
+    Raises:
+        ValueError: xarray is not installed; a coordinate is called "t".
+    """
     try:
         import xarray
     except ImportError as error:
         raise unsupported(
             "`to_xarray`", "xarray is not installed", 'pip install "jaxlag[xarray]"'
         ) from error
-    batch = motion.ts.ndim - 1
+    if "t" in values:
+        why = "the coordinate 't' has the name of the times"
+        raise unsupported("`to_xarray`", why, "Give it another name.")
+    batch = ts.ndim - 1
     axes = ("motion",) if batch == 1 else tuple(f"motion_{i}" for i in range(batch))
-    ts = np.asarray(motion.ts)
     first = ts[(0,) * batch]
     common = bool(np.all(ts == first))
     along = "t" if common else "save"
     variables = {}
-    for name, value in as_dict(motion).items():
-        if name != "t":
-            more = [f"{name}_{i}" for i in range(value.ndim - batch - 1)]
-            variables[name] = ((*axes, along, *more), value)
-    variables["status"] = (axes, np.asarray(motion.status))
+    for name, value in values.items():
+        more = [f"{name}_{i}" for i in range(value.ndim - batch - 1)]
+        variables[name] = ((*axes, along, *more), value)
+    variables |= {name: (axes, value) for name, value in facts.items()}
     time = ("t", first) if common else ((*axes, "save"), ts)
     return xarray.Dataset(variables, {"t": time})
 

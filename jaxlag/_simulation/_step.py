@@ -21,7 +21,7 @@ from jaxlag._model._inputs import check_inputs, check_range, common_range, knots
 from jaxlag._model._states import check_no_states, named_states
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import choose
-from jaxlag._simulation._option_checks import (
+from jaxlag._simulation._options._option_checks import (
     check_formulation,
     check_options,
     check_states_start,

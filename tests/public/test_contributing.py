@@ -192,7 +192,7 @@ def test_table_of_packages_equals_that_of_the_test():
 def test_reserved_names_of_packages_are_free():
     part = ARCHITECTURE.read_text().split("## Where a new capability goes")[1]
     names = re.findall(r"^- `(\w+)`, above", part, re.MULTILINE)
-    assert len(names) == 4
+    assert len(names) == 3
     assert not set(names) & {path.stem for path in Path(jl.__file__).parent.iterdir()}
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -57,25 +57,30 @@ def check_options(
     if baumgarte and not system.constraints:
         must = "be left out for a system without constraints"
         raise invalid("stabilization", must, f"it was {stabilization!r}")
-    for name in name_sequence("save", save):
+    check_quantities(system, "save", save)
+    positive_integer("max_steps", max_steps)
+
+
+def check_quantities(system: System, argument: str, names: Any) -> None:
+    """Raise on names that are no quantities of the system."""
+    for name in name_sequence(argument, names):
         if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
             known = [*QUANTITIES, "work"]
             fix = "Write 'multipliers'." if name == "lam" else ""
-            raise invalid("save", f"name quantities among {known}", f"one was {name!r}", fix)
+            raise invalid(argument, f"name quantities among {known}", f"one was {name!r}", fix)
         if name == "u" and system.quasi is None:
             must, was = "name quantities of the system", "one was 'u' without quasi-velocities"
-            raise invalid("save", must, was, "Declare the system with quasi=.")
+            raise invalid(argument, must, was, "Declare the system with quasi=.")
         if name == "state_rates" and system.states is None:
             must, was = "name quantities of the system", "one was 'state_rates' without states"
-            raise invalid("save", must, was, "Declare the system with states=.")
+            raise invalid(argument, must, was, "Declare the system with states=.")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise invalid(
-                "save",
+                argument,
                 "name energies that the system declares",
                 f"one was {name!r}",
                 "Declare the system with kinetic= and potential=.",
             )
-    positive_integer("max_steps", max_steps)
 
 
 def check_solver(solver: Any, stabilization: Any, gradient_memory: Any) -> None:
@@ -174,7 +179,22 @@ def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
     raise invalid(argument, must, f"it was {x!r}", "Give real numbers.")
 
 
+class DirectedTimes(NamedTuple):
+    """Times that may be traced, in a direction that is known.
+
+    Attributes:
+        ts: checked times, (s,).
+        time_direction: 1 or -1; None if it is not known.
+    """
+
+    ts: Any
+    time_direction: int | None
+
+
 def check_times(ts: Any) -> tuple[Any, int | None]:
+    """(times, 1 or -1 for their direction, None if they are traced)."""
+    if isinstance(ts, DirectedTimes):
+        return check_times(ts.ts)[0], ts.time_direction
     if ts is None:
         raise invalid("ts", "be given", "it was None", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number("ts", "be an array of times", ts, jnp.result_type(float))

@@ -1,0 +1,1 @@
+"""Options of `simulate`: checks, requirements of methods, options that others pass on."""

@@ -1,0 +1,1 @@
+"""Sweeps: many trajectories of one system with different starts, params and inputs."""
