@@ -68,8 +68,12 @@ from jaxlag._statics._inverse_dynamics import inverse_dynamics as inverse_dynami
 from jaxlag._statics._inverse_dynamics import prescribed_motion as prescribed_motion
 from jaxlag._sweep._case import Case as Case
 from jaxlag._sweep._replay import replay as replay
+from jaxlag._sweep._statistics import Reduction as Reduction
+from jaxlag._sweep._statistics import Statistics as Statistics
 from jaxlag._sweep._sweep import sweep as sweep
+from jaxlag._sweep._sweep_result import StoredSweep as StoredSweep
 from jaxlag._sweep._sweep_result import SweepResult as SweepResult
+from jaxlag._sweep._sweep_result import open_sweep as open_sweep
 from jaxlag._system._system import System as System
 
 __version__ = _version("jaxlag")

@@ -298,7 +298,7 @@ def _transpose(cotangents: Leaves, *args: Any, form: LinearMap, count: int) -> l
 ad.primitive_transposes[_linear_map] = _transpose
 
 
-def _repeated(x: Any, count: int) -> Any:
+def _repeated(x: Any, count: Any) -> Any:
     """x for every lane; a number of an interpreted program is no array."""
     x = jnp.asarray(x, getattr(x, "dtype", None))
     return jnp.broadcast_to(x, (count, *x.shape))

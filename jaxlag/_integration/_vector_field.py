@@ -413,14 +413,14 @@ class VectorField(eqx.Module):
         if self.rows.size or self.quasi is not None or self.system.states is not None:
             return None
         _, q, _, params, values = self.at(tau, y, args)
-        return self.program.variables(q, params, values)
+        return self.program.variables(q, params, values, self.sample)
 
     def is_analytic(self, tau: Array, y: Array, args: Arguments) -> bool:
         """Whether the scalar program of accelerations has no comparisons or unusual functions."""
         _, q, _, params, values = self.at(tau, y, args)
-        return self.program.is_analytic(q, params, values)
+        return self.program.is_analytic(q, params, values, self.sample)
 
     def why_on_arrays(self, tau: Array, y: Array, args: Arguments) -> str | None:
         """Why there is no scalar program; None if there is one, or none is wanted."""
         _, q, _, params, values = self.at(tau, y, args)
-        return self.program.why_on_arrays(q, params, values)
+        return self.program.why_on_arrays(q, params, values, self.sample)

@@ -188,15 +188,21 @@ class AccelerationProgram(eqx.Module):
         """Number of lines of the scalar program of accelerations; None if there is none."""
         return None
 
-    def variables(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> frozenset[str] | None:
+    def variables(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> frozenset[str] | None:
         """Those of (t, q, v) that the scalar program reads; None if there is none."""
         return None
 
-    def is_analytic(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> bool:
+    def is_analytic(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> bool:
         """Whether there is a scalar program without comparisons and unusual functions."""
         return False
 
-    def why_on_arrays(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
+    def why_on_arrays(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> str | None:
         """Why there is no scalar program; None if there is one, or none is wanted."""
         return None
 

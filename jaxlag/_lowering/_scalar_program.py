@@ -347,19 +347,25 @@ class ScalarProgram(AccelerationProgram):
         equations = self.lowered(q, params, inputs).equations
         return None if equations is None else len(equations.program.body)
 
-    def variables(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> frozenset[str] | None:
+    def variables(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> frozenset[str] | None:
         """By the program; None also with inputs, which may depend on all of them."""
-        equations = None if inputs else self.lowered(q, params, inputs).equations
+        equations = None if inputs else self.lowered(q, params, inputs, sample).equations
         if equations is None:
             return None
         return frozenset(name for name, _ in equations.program.inputs) & {"t", "q", "v"}
 
-    def is_analytic(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> bool:
+    def is_analytic(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> bool:
         """By the body of the program."""
-        equations = self.lowered(q, params, inputs).equations
+        equations = self.lowered(q, params, inputs, sample).equations
         return equations is not None and equations.program.is_analytic
 
-    def why_on_arrays(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
+    def why_on_arrays(
+        self, q: Any, params: Any, inputs: Mapping[str, Any], sample: _params.Sample
+    ) -> str | None:
         """The reason of the lowering."""
-        lowered = self.lowered(q, params, inputs)
+        lowered = self.lowered(q, params, inputs, sample)
         return lowered.reason if lowered.equations is None else None

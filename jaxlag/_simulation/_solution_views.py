@@ -111,7 +111,7 @@ def dataset(
         facts: of each, (...), by name.
 
     Raises:
-        ValueError: xarray is not installed; a coordinate is called "t".
+        ValueError: xarray is not installed; a coordinate is called "t", or as one of the facts.
     """
     try:
         import xarray
@@ -122,6 +122,10 @@ def dataset(
     if "t" in values:
         why = "the coordinate 't' has the name of the times"
         raise unsupported("`to_xarray`", why, "Give it another name.")
+    for name in facts:
+        if name in values:
+            why = f"{name!r} is a coordinate or a state, and how a motion ended"
+            raise unsupported("`to_xarray`", why, "Give it another name.")
     batch = ts.ndim - 1
     axes = ("motion",) if batch == 1 else tuple(f"motion_{i}" for i in range(batch))
     first = ts[(0,) * batch]

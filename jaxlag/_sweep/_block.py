@@ -5,7 +5,6 @@ the last bits of results. So all blocks of a sweep are computed by the same prog
 number of trajectories of the sweep. Those beyond the last one start from NaN, and end there.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,9 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxlag._core._arrays import array_of
 from jaxlag._core._batching import VECTORIZED, VECTORIZED_FROM
-from jaxlag._core._errors import invalid
 from jaxlag._simulation._options._option_checks import DirectedTimes
 from jaxlag._simulation._simulate import simulate
 from jaxlag._simulation._solution import Solution
@@ -116,17 +113,11 @@ def solve_block(key: BlockKey, ts: Any, shared: Any, own: Any, count: Any) -> Bl
         case = _case(key, shared, own)
 
         def start(x: Any) -> Array:
-            try:
-                x = array_of(x)
-            except (TypeError, ValueError) as error:
-                raise invalid("q0", "be numbers", f"it was {x!r}") from error
-            if jnp.issubdtype(x.dtype, jnp.integer):
-                x = x.astype(jnp.result_type(float))
             return jnp.where(i < count, x, jnp.nan)
 
         motion = simulate(
             key.system,
-            _each(start, case.q0),
+            jax.tree.map(start, case.q0),
             case.v0,
             DirectedTimes(ts, key.time_direction),
             case.params,
@@ -145,41 +136,27 @@ def solve_block(key: BlockKey, ts: Any, shared: Any, own: Any, count: Any) -> Bl
     return jax.vmap(one, (None if ts.ndim == 1 else 0, 0, 0))(ts, own, jnp.arange(key.size))
 
 
-def _each(function: Callable, q0: Any) -> Any:
-    """Of a start, or of each of its parts by name."""
-    if isinstance(q0, Mapping):
-        return {name: function(x) for name, x in q0.items()}
-    return function(q0)
-
-
-def kept(key: BlockKey, motions: Solution) -> dict[str, np.ndarray]:
+def values_of(key: BlockKey, motions: Solution) -> dict[str, Any]:
     """What is kept of the motions, by name, each (size, s, *its shape)."""
     system = key.system
     coordinates, quasi, states = system.coordinates, system.quasi, system.states
-    q, v = np.asarray(motions.q), np.asarray(motions.v)
 
     def state(name: str) -> Any:
         if name in coordinates.names:
-            return coordinates.unflatten(q)[name]
+            return coordinates.unflatten(motions.q)[name]
         if states is not None and name in states.names:
-            return states.layout.unflatten(np.asarray(motions.x))[name]
+            return states.layout.unflatten(motions.x)[name]
         if quasi is not None and name in quasi.names:
-            return np.asarray(motions.saved["u"])[..., quasi.names.index(name)]
-        return coordinates.unflatten(v)[name.removesuffix("'")]
+            return motions.saved["u"][..., quasi.names.index(name)]
+        return coordinates.unflatten(motions.v)[name.removesuffix("'")]
 
     saved = {name: motions.saved[name] for name in key.save}
-    quantities = {name: np.asarray(x) for name, x in flat_quantities(saved).items()}
-    return {name: state(name) for name in key.keep} | quantities
+    return {name: state(name) for name in key.keep} | flat_quantities(saved)
 
 
-def facts_of(block: Block) -> dict[str, np.ndarray]:
-    """What is kept of every trajectory: times, how it ended, and its steps."""
+def facts_of(key: BlockKey, block: Block) -> dict[str, Any]:
+    """How each trajectory ended, its steps, and its times if they are its own."""
     motions = block.motions
-    found = {
-        "ts": motions.ts,
-        "status": block.status,
-        "where": block.where,
-        "last_time": motions.last_time,
-        **motions.stats,
-    }
-    return {name: np.asarray(x) for name, x in found.items()}
+    own = {"t": motions.ts} if key.time_direction is None else {}
+    ended = {"status": block.status, "where": block.where, "last_time": motions.last_time}
+    return ended | dict(motions.stats) | own

@@ -1,10 +1,8 @@
 """The cases of a sweep: drawn at random, or entries of arrays."""
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from hashlib import sha256
+from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from typing import Any
 
@@ -16,9 +14,11 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.tree_util import keystr
 
 from jaxlag._core._arguments import positive_integer
+from jaxlag._core._arrays import array_of
 from jaxlag._core._errors import invalid
-from jaxlag._core._jaxprs import constants, equations
+from jaxlag._core._jaxprs import equations
 from jaxlag._sweep._case import Case
+from jaxlag._sweep._digest import digest_of, digest_of_program, without_addresses
 from jaxlag._system._system import System
 from jaxlag._tracing._params import Static, arrays_apart, check_keys, halves, join
 
@@ -45,6 +45,11 @@ class AbstractCases(ABC):
     def form(self) -> "AbstractCases":
         """The same without numbers, for the key of a compiled program."""
 
+    @property
+    @abstractmethod
+    def digests(self) -> dict[str, str]:
+        """Digests of all that the cases depend on, by name."""
+
     @abstractmethod
     def arguments(self, indices: np.ndarray) -> tuple[Any, Any]:
         """Arrays from which `case` makes these: (those shared by all, entries for each)."""
@@ -63,6 +68,23 @@ def cases_of(system: System, given: Any, n: Any, seed: int) -> tuple[AbstractCas
         raise invalid("cases", must, was)
     count = positive_integer("n", n)
     return _drawn(given, seed), count
+
+
+def _starts(case: Case) -> dict[str, Any]:
+    """Starts of a case as floating-point numbers: arrays, or arrays by name."""
+
+    def numbers(name: str, x: Any) -> Any:
+        if x is None:
+            return None
+        if isinstance(x, Mapping):
+            return {key: numbers(f"{name}[{key!r}]", value) for key, value in x.items()}
+        try:
+            x = np.asarray(x, float) if isinstance(x, np.ndarray) else array_of(x)
+        except (TypeError, ValueError) as error:
+            raise invalid(f"cases: {name}", "be numbers", f"it was {x!r}") from error
+        return x.astype(jnp.result_type(float)) if jnp.issubdtype(x.dtype, jnp.integer) else x
+
+    return {name: numbers(name, getattr(case, name)) for name in _STARTS}
 
 
 def _times(ts: Any, ranks: tuple[int, ...]) -> Any:
@@ -103,6 +125,11 @@ class Drawn(AbstractCases):
     def form(self) -> AbstractCases:
         """The same, with another seed."""
         return replace(self, seed=0)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Of the function, and the seed."""
+        return {"cases": self.digest, "seed": str(self.seed)}
 
     def arguments(self, indices: np.ndarray) -> tuple[Any, Any]:
         """(the key of the sweep, indices)."""
@@ -147,8 +174,8 @@ def _traced(draw: Callable, seed: int) -> tuple[Drawn, list[Any]]:
         case = draw(key, index)
         if not isinstance(case, Case):
             raise invalid("cases", "return a jl.Case", f"it returned a {type(case).__name__}")
-        if case.ts is not None:
-            case = replace(case, ts=_times(case.ts, (1,)))
+        ts = None if case.ts is None else _times(case.ts, (1,))
+        case = replace(case, **_starts(case), ts=ts)
         check_keys(case, "cases")
         traced, static = arrays_apart(case)
         parts[:] = jax.tree.structure(traced), Static(static)
@@ -160,14 +187,9 @@ def _traced(draw: Callable, seed: int) -> tuple[Drawn, list[Any]]:
     if calls:
         must, was = "be computed by JAX alone", f"it calls back to Python by {calls[0]}"
         raise invalid("cases", must, was)
-    digest = sha256(re.sub("0x[0-9a-f]+", "", str(program)).encode())  # without addresses
-    for x in constants(program):
-        is_key = jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-        array = np.asarray(jax.random.key_data(x) if is_key else x)
-        digest.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
     tree, static = parts
     plain = [x for x in jax.tree.leaves(static.tree) if not callable(x)]
-    return Drawn(digest.hexdigest(), static, tree, program, seed), plain
+    return Drawn(digest_of_program(program), static, tree, program, seed), plain
 
 
 # ---- Stacked -------------------------------------------------------------------------------------
@@ -192,6 +214,13 @@ class Stacked(AbstractCases):
         """The same without arrays."""
         return replace(self, own=None, shared=None)
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """Of each part."""
+        case = self.case(self.shared, self.own)
+        parts = {f"cases.{x.name}": getattr(case, x.name) for x in fields(Case)}
+        return {name: digest_of(_structure(x), x) for name, x in parts.items()}
+
     def arguments(self, indices: np.ndarray) -> tuple[Any, Any]:
         """(arrays shared by all, entries)."""
         return self.shared, jax.tree.map(lambda x: x[indices], self.own)
@@ -199,6 +228,10 @@ class Stacked(AbstractCases):
     def case(self, shared: Any, own: Any) -> Case:
         """That of these entries."""
         return eqx.combine(join(own, self.static.tree), shared)
+
+
+def _structure(tree: Any) -> str:
+    return without_addresses(str(jax.tree.structure(tree)))
 
 
 def _stacked(system: System, case: Case, n: Any) -> tuple[Stacked, int]:
@@ -230,24 +263,13 @@ def _stacked(system: System, case: Case, n: Any) -> tuple[Stacked, int]:
 
 def _with_arrays(system: System, case: Case) -> Case:
     """The same with starts and times as arrays of shapes that are allowed."""
-    layouts = {"q0": system.coordinates, "v0": system.coordinates, "u0": None, "x0": None}
+    layouts = {"q0": system.coordinates, "v0": system.coordinates}
     if system.states is not None:
         layouts["x0"] = system.states.layout
-
-    def array(name: str, x: Any) -> Any:
-        try:
-            return x if x is None or eqx.is_array(x) else np.asarray(x, float)
-        except (TypeError, ValueError) as error:
-            raise invalid(f"cases: {name}", "be numbers", f"it was {x!r}") from error
-
-    given = {}
+    given = _starts(case)
     for name, layout in layouts.items():
-        x = getattr(case, name)
-        if isinstance(x, Mapping):
-            given[name] = {key: array(f"{name}[{key!r}]", value) for key, value in x.items()}
-            continue
-        given[name] = x = array(name, x)
-        if x is None or layout is None:
+        x = given[name]
+        if x is None or isinstance(x, Mapping):
             continue
         shape, size = x.shape, layout.size
         alone = size == 1 and x.ndim <= 1  # a number stands for one of one entry

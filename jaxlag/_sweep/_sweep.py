@@ -1,41 +1,22 @@
 """`sweep`: many trajectories of one system, each a function of its case."""
 
 import time
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
-import jax
-import numpy as np
-
-from jaxlag._core._arguments import name_sequence
 from jaxlag._core._errors import invalid
-from jaxlag._simulation._options._option_checks import (
-    check_options,
-    check_quantities,
-    check_times,
-)
-from jaxlag._simulation._options._simulate_options import NO_OPTIONS, plain_options
-from jaxlag._simulation._quantities import QUANTITIES
-from jaxlag._sweep._block import (
-    Block,
-    BlockKey,
-    block_indices,
-    block_size,
-    cases_in,
-    facts_of,
-    kept,
-    solve_block,
-)
-from jaxlag._sweep._cases import AbstractCases, cases_of
-from jaxlag._sweep._sweep_result import SweepReport, SweepResult, counted
-from jaxlag._system._system import System
-from jaxlag._tracing._traced_function import warn_of_changes
+from jaxlag._simulation._options._simulate_options import NO_OPTIONS
+from jaxlag._sweep._cores import computed_rows
+from jaxlag._sweep._plan import Plan, planned
+from jaxlag._sweep._problem import problem_of
+from jaxlag._sweep._progress import Progress, between_blocks
+from jaxlag._sweep._record import AbstractRecord, InMemory, Rows
+from jaxlag._sweep._statistics import Reduction, Statistics
+from jaxlag._sweep._store import created
+from jaxlag._sweep._sweep_result import SweepReport, SweepResult, totals
 
-TAKEN = ("q0", "v0", "u0", "x0", "ts", "params", "inputs", "save", "throw", "estimate_error")
-"""Arguments of `simulate` that a sweep sets itself."""
-IN_FLIGHT = 2
-"""Blocks that are computed at a time."""
+_STOPPED = "The sweep was stopped. What is in its store is kept: the same call goes on from there."
 
 
 def sweep(
@@ -46,14 +27,21 @@ def sweep(
     *,
     seed: Any = 0,
     keep: Any = None,
+    store: Any = None,
+    overwrite: Any = False,
+    statistics: Any = None,
+    reduce: Any = None,
     simulate_options: Any = NO_OPTIONS,
 ) -> SweepResult:
     """Simulate n trajectories, and keep what is named.
 
     Trajectory i has the same bits for any n, and whatever the other trajectories do. They are
-    computed in blocks of a fixed number, which run one after the other: the memory of the solves is
-    that of some blocks. As under `jax.vmap`, "auto" does not change the method or the formulation
+    computed in blocks of a fixed number, one at a time by each core: the memory of the solves is
+    that of these blocks. As under `jax.vmap`, "auto" does not change the method or the formulation
     of a motion that fails: pass the method for stiff systems.
+
+    On a terminal a bar shows the progress if tqdm is installed; elsewhere the logger "jaxlag" has a
+    line of level INFO every 30 s. Ctrl-C ends a sweep after the block that is being computed.
 
     Args:
         system: the mechanical system.
@@ -67,6 +55,14 @@ def sweep(
         keep: names of coordinates, "x'" for the velocity of "x", quasi-velocities, states, and of
             quantities as in `save=` of `simulate`; None for all but these quantities. One that is
             a dict is kept by its keys: "power" as `run["power drag"]`.
+        store: path of a folder, in which the trajectories are kept in place of the memory, block
+            by block, as a group of zarr 3. A sweep that was ended at any moment goes on by the same
+            call, and its files have the same bits then. One sweep at a time writes to a store.
+        overwrite: whether a store of another sweep there is replaced; one of this sweep goes on.
+        statistics: names, or `Statistics`, whose results are `run.statistics`; they are computed
+            while the sweep runs. With `keep=()` nothing else is kept of the trajectories than how
+            they ended. In a store they are computed of what `keep` names.
+        reduce: `Reduction`, any other statistics; its result is `run.reduced`.
         simulate_options: options of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
 
     Returns:
@@ -75,7 +71,9 @@ def sweep(
 
     Raises:
         ValueError: an argument of wrong form or value, named; `cases` returns something else than a
-            `Case`, is not traceable, or depends on more than key and index.
+            `Case`, is not traceable, or depends on more than key and index; the store is of another
+            sweep, whose difference is named.
+        OSError: the store cannot be written; what it has is kept.
 
     Example:
         A thousand pendulums of random length, from the same angle:
@@ -93,99 +91,66 @@ def sweep(
         1000 trajectories: 1000 ok (1000, 5)
     """
     begun = time.monotonic()
-    check_options(system, "auto", None, "projection", False, (), 1)
-    given, count = cases_of(system, cases, n, _checked_seed(seed))
-    warn_of_changes(system, given.static.tree.inputs)
-    options = plain_options(simulate_options, "jl.sweep", TAKEN)
-    keeping = _keeping(system, keep)
-    common, times = _times(given, ts)
-    state = system.size + (0 if system.states is None else system.states.size)
-    size = block_size(times * state * (1 + sum(map(len, keeping))))
-    direction = None if common is None else 1 if common[-1] > common[0] else -1
-    key = BlockKey(system, given.form, *keeping, tuple(options.items()), direction, size)
-    values: dict[str, np.ndarray] = {}
-    facts: dict[str, np.ndarray] = {}
+    if not isinstance(overwrite, bool):
+        raise invalid("overwrite", "be True or False", f"it was {overwrite!r}")
+    statistics, reduce = _checked_statistics(statistics), _checked_reduction(reduce)
+    also = () if statistics is None else tuple(statistics.names)
+    plan = planned(system, cases, n, ts, seed, keep, also, simulate_options)
+    if store is not None and set(also) - set(plan.layout.values):
+        raise invalid("keep", f"have the names of the statistics, {list(also)}", f"it was {keep}")
+    record = _record(plan, store, overwrite)
+    streams = {"statistics": statistics, "reduced": reduce}
+    streams = {name: stream for name, stream in streams.items() if stream is not None}
+    results: dict[str, Any] = {}
     first_seconds = 0.0
-    for first, block in _blocks(key, given, common, count):
-        first_seconds = first_seconds or time.monotonic() - begun
-        _fill(values, count, first, kept(key, block.motions))
-        _fill(facts, count, first, facts_of(block))
-    for name in key.save:
-        if not any(x == name or x.startswith(f"{name} ") for x in values):
-            raise invalid("keep", "name what the system has", f"it has no {name!r}")
-    own_times = facts.pop("ts")
+    missing = record.missing()
+    progress = Progress(plan.layout.count, plan.layout.count - plan.layout.trajectories(missing))
+    with record.writer() as write, between_blocks(_STOPPED) as stop, closing(progress):
+        for block, rows, is_new in _rows(plan, record, missing, bool(streams)):
+            first_seconds = first_seconds or time.monotonic() - begun
+            if is_new:
+                write(block, rows)
+                progress.advance(rows["status"])
+            for name, stream in streams.items():
+                part = stream.of_block(block * plan.layout.size, rows)
+                results[name] = stream.merge(results[name], part) if name in results else part
+            stop()
     report = SweepReport(
-        count,
-        counted(facts["status"]),
-        int(facts["accepted"].sum()),
-        int(facts["rejected"].sum()),
-        time.monotonic() - begun,
-        first_seconds,
-        key.size,
+        trajectories=plan.layout.count,
+        computed=plan.layout.trajectories(missing),
+        **totals(record),
+        seconds=time.monotonic() - begun,
+        first_seconds=first_seconds,
+        block=plan.layout.size,
     )
-    when = own_times if common is None else common
-    return SweepResult(system, when, values, **facts, report=report, _key=key, _cases=given)
+    found = results.get("statistics"), results.get("reduced")
+    return SweepResult(record, plan.key.system, report, *found, plan.key, plan.cases)
 
 
-def _checked_seed(seed: Any) -> int:
-    is_integer = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not is_integer or not 0 <= seed < 2**32:
-        raise invalid("seed", "be an integer from 0 to 2^32 - 1", f"it was {seed!r}")
-    return int(seed)
+def _record(plan: Plan, store: Any, overwrite: bool) -> AbstractRecord:
+    """Where the trajectories are kept."""
+    if store is None:
+        return InMemory(plan.layout)
+    return created(store, problem_of(plan), plan.layout, overwrite)
 
 
-def _keeping(system: System, keep: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the states and of the quantities that are kept."""
-    states = [x for name in system.coordinates.names for x in (name, f"{name}'")]
-    states += [] if system.quasi is None else system.quasi.names
-    states += [] if system.states is None else system.states.names
-    if keep is None:
-        return tuple(states), ()
-    names = tuple(dict.fromkeys(name_sequence("keep", keep)))
-    if not names:
-        raise invalid("keep", "name something", "it was empty", "Leave it out for all states.")
-    known = [*states, *QUANTITIES, "work"]
-    for name in names:
-        if name not in known:
-            raise invalid("keep", f"name some of {known}", f"one was {name!r}")
-    quantities = tuple(name for name in names if name not in states)
-    check_quantities(system, "keep", quantities)
-    return tuple(name for name in names if name in states), quantities
+def _checked_statistics(given: Any) -> Statistics | None:
+    return given if given is None or isinstance(given, Statistics) else Statistics(given)
 
 
-def _times(cases: AbstractCases, ts: Any) -> tuple[np.ndarray | None, int]:
-    """(common times, None if each case has its own; their number)."""
-    shared, own = cases.arguments(np.zeros(1, int))
-    one = jax.tree.map(lambda x: x[0], own)
-    given = jax.eval_shape(lambda: cases.case(shared, one).ts)
-    if (given is None) == (ts is None):
-        was = "neither was given" if ts is None else "both were given"
-        raise invalid("exactly one of `ts` and the `ts` of the cases", "be given", was)
-    if ts is None:
-        return None, given.shape[-1]
-    ts = np.asarray(check_times(ts)[0])
-    return ts, ts.shape[0]
+def _checked_reduction(given: Any) -> Reduction | None:
+    if given is None or isinstance(given, Reduction):
+        return given
+    raise invalid("reduce", "be a jl.Reduction", f"it was {given!r}")
 
 
-def _blocks(
-    key: BlockKey, cases: AbstractCases, common: np.ndarray | None, count: int
-) -> Iterator[tuple[int, Block]]:
-    """(index of its first trajectory, block) for each block; some are computed at a time."""
-    ahead: deque[tuple[int, Block]] = deque()
-    for first in range(0, count, key.size):
-        shared, own = cases.arguments(block_indices(first, key.size, count))
-        ts = cases_in(key, shared, own).ts if common is None else common
-        ahead.append((first, solve_block(key, ts, shared, own, count - first)))
-        if len(ahead) == IN_FLIGHT:
-            yield ahead.popleft()
-    yield from ahead
-
-
-def _fill(
-    whole: dict[str, np.ndarray], count: int, first: int, part: Mapping[str, np.ndarray]
-) -> None:
-    """Write the trajectories of a block, from the index `first` on, into those of the sweep."""
-    for name, x in part.items():
-        if name not in whole:
-            whole[name] = np.empty((count, *x.shape[1:]), x.dtype)
-        whole[name][first : first + len(x)] = x[: count - first]
+def _rows(
+    plan: Plan, record: AbstractRecord, missing: list[int], every: bool
+) -> Iterator[tuple[int, Rows, bool]]:
+    """(index, rows, whether they are computed now) of every block, or of those not kept yet."""
+    computed, absent = computed_rows(plan, missing), set(missing)
+    for block in range(plan.layout.blocks) if every else missing:
+        if block in absent:
+            yield block, next(computed), True
+        else:
+            yield block, {name: record.rows(name, block) for name in plan.layout.arrays}, False

@@ -102,7 +102,7 @@ class TracedFunction:
         static = _params.Static(rest)
         if not _params.are_keys(rest):  # compiled programs cannot have such params either
             return _called(self.function, [plain(x) for x in arguments])
-        kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
+        kind = (tree, static, tuple(_params.shapes(leaves)), named, jax_settings())
         program = self._programs.get(kind)
         if program is None:
             program = self._closing(params, kind, leaves)
@@ -327,7 +327,7 @@ def _parts_of(declared: Any) -> list[Any]:
     return []
 
 
-def _config() -> tuple:
+def jax_settings() -> tuple:
     """The JAX settings that affect tracing."""
     config: Any = jax.config
     return (

@@ -227,6 +227,15 @@ def test_constrained_states_of_indefinite_mass_are_not_compared():
     assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
 
 
+def test_a_motion_is_compared_with_its_params():
+    """L is finite for none of the random params, which lie between 0.5 and 1.5."""
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(p["k"] - 9.0) * q[0], ("x",))
+    params = {"k": 13.0}
+    motion = jl.simulate(system, [0.0], [0.0], [0.0, 1.0], params)
+    np.testing.assert_allclose(motion["x"][-1], -1.0, rtol=1e-12)
+    assert "equal to the array program at 8 random states" in system.explain(params)
+
+
 @pytest.mark.full
 def test_given_params_are_compared():
     """An inertia that random params would make indefinite."""

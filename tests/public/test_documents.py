@@ -25,11 +25,12 @@ FIRST = 4
 """Blocks of the README's opening example: a program and its output, twice."""
 
 
-@pytest.mark.parametrize(
-    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 11)], (FIRST, 2)), ids=["first", "all"]
-)
-def test_readme_prints_the_stated_output(count, outputs):
-    assert run("README.md", blocks(README)[:count], {}) == outputs
+@pytest.mark.parametrize("count", mostly_full([FIRST, None], FIRST), ids=["first", "all"])
+def test_readme_prints_the_stated_output(count):
+    shown = blocks(README)[:count]
+    outputs = sum(language == "text" for _, language, _ in shown)
+    assert outputs >= 2
+    assert run("README.md", shown, {}) == outputs
 
 
 def test_readme_shows_the_same_numbers_twice():

@@ -24,6 +24,7 @@ def with_fewer_divisions(program: FlatProgram) -> FlatProgram:
     """
     divisions = [x for x in program.operations if _divides(program, x)]
     counts = Counter(x.operands[1] for x in divisions if isinstance(x.operands[1], int))
+    product = jax.make_jaxpr(lax.mul)(1.0, 1.0).eqns[0].params
     inverse: dict[int, Value] = {}
     operations, avals = list[Operation](), list(program.avals)
     for operation in program.operations:
@@ -40,7 +41,7 @@ def with_fewer_divisions(program: FlatProgram) -> FlatProgram:
             one = np.ones((), avals[y].dtype)
             operations.append(Operation(lax.div_p, {}, (one, y), (len(avals) - 1,)))
         if isinstance(y, int) and y in inverse:
-            operation = Operation(lax.mul_p, {}, (x, inverse[y]), operation.results)
+            operation = Operation(lax.mul_p, product, (x, inverse[y]), operation.results)
         elif isinstance(y, int) and not isinstance(x, int) and x == 1.0:
             inverse[operation.results[0]] = y
         operations.append(operation)
