@@ -103,6 +103,9 @@ def name_sequence(argument: str, x: Any, fix: str | None = None) -> tuple[str, .
         )
     if not isinstance(x, Sequence):
         raise invalid(argument, "be a sequence of names", f"it was {x!r}", fix or "")
+    for name in x:
+        if not isinstance(name, str):
+            raise invalid(argument, "be a sequence of names", f"one was {name!r}", fix or "")
     return tuple(x)
 
 

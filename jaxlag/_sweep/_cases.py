@@ -243,10 +243,12 @@ def _stacked(system: System, case: Case, n: Any) -> tuple[Stacked, int]:
     def divided(path: Any, x: Any) -> tuple[Any, Any, Any]:
         """(what is not traced, an array with a leading axis, a shared array)."""
         name = f"cases{keystr(path)}"
-        if _is_repeated(x):
-            lengths[name], x = x.shape[0], x[0]
-        elif np.ndim(x) > _rank_of_one(system, path, x):
+        is_own = np.ndim(x) > _rank_of_one(system, path, x)
+        if is_own:
             lengths[name] = x.shape[0]
+        if is_own and _is_repeated(x):
+            x = x[0]
+        elif is_own:
             if x.dtype == bool:
                 must, was = "be numbers where trajectories differ", "it was an array of bool"
                 raise invalid(name, must, was, "Write x.astype(float).")

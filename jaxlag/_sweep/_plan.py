@@ -91,7 +91,8 @@ def planned(
     facts = _of_one(lambda block: facts_of(key, block), traced.out_info)
     for name in quantities:
         if not any(_belongs(x, name) for x in values):
-            raise invalid("keep", "name what the system has", f"it has no {name!r}")
+            argument = "keep" if name in kept else "statistics"
+            raise invalid(argument, "name what the system has", f"it has no {name!r}")
     for name in also:
         if name not in values:
             raise invalid("statistics", f"name some of {list(values)}", f"one was {name!r}")

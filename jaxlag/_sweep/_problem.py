@@ -38,7 +38,7 @@ def problem_of(plan: Plan) -> Mapping[str, Any]:
         "ts": "of each case" if ts is None else f"{_shown(ts)}, {digest_of('times', ts)}",
         **plan.cases.digests,
         "keep": [*key.keep, *key.save],
-        "simulate_options": {name: without_addresses(repr(x)) for name, x in key.options},
+        "simulate_options": {name: without_addresses(repr(x)) for name, x in sorted(key.options)},
         "values": list(layout.values),
         "block": layout.size,
         "equations": digest_of(text, arrays_in(plan.traced.jaxpr)),

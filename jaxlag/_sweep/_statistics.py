@@ -16,8 +16,12 @@ CENTROIDS = 1000
 """Compression of a t-digest."""
 
 
+_of_any_size = np.errstate(over="ignore", invalid="ignore")
+"""Squares of values beyond 1e154 are infinite."""
+
+
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Statistics:
     """Statistics that a sweep computes while it runs, at each time and for each component.
 
@@ -46,7 +50,9 @@ class Statistics:
         for name in ("covariance", "quantiles"):
             if not isinstance(getattr(self, name), bool):
                 raise invalid(name, "be True or False", f"it was {getattr(self, name)!r}")
-        edges = {name: self._edges(name, x) for name, x in dict(self.histograms).items()}
+        if not isinstance(self.histograms, Mapping):
+            raise invalid("histograms", "be edges by name", f"it was {self.histograms!r}")
+        edges = {name: self._edges(name, x) for name, x in self.histograms.items()}
         object.__setattr__(self, "histograms", edges)
         if self.quantiles:
             _datasketches()
@@ -56,22 +62,24 @@ class Statistics:
         if name not in self.names:
             raise invalid("histograms", f"have keys among {list(self.names)}", f"one was {name!r}")
         try:
-            edges = np.asarray(given, float)
+            edges = np.array(given, float)
         except (TypeError, ValueError) as error:
             raise invalid(argument, "be edges of bins", f"it was {given!r}") from error
         if edges.ndim != 1 or edges.size < 2 or not np.all(np.diff(edges) > 0):
             raise invalid(argument, "be at least 2 increasing edges of bins", f"it was {edges}")
+        edges.setflags(write=False)
         return edges
 
+    @_of_any_size
     def of_block(self, first: int, rows: Rows) -> "StatisticsResult":
         """Those of the trajectories of a block, from the index `first` on."""
         arrays = {name: np.asarray(rows[name], float) for name in self.names}
         summaries = {}
         for name, x in arrays.items():
-            digests = _Digests.of(x) if self.quantiles else None
+            sketches = _Sketches.of(x) if self.quantiles else None
             edges = self.histograms.get(name)
             histogram = None if edges is None else Histogram.of(edges, x)
-            summaries[name] = Summary(Moments.of(first, x), digests, histogram)
+            summaries[name] = Summary(Moments.of(first, x), sketches, histogram)
         joint = _Joint.of(list(arrays.values())) if self.covariance else None
         shapes = {name: x.shape[2:] for name, x in arrays.items()}
         return StatisticsResult(summaries, joint, shapes)
@@ -177,14 +185,14 @@ class Histogram(NamedTuple):
         return Histogram(self.edges, *sums)
 
 
-class _Digests(NamedTuple):
+class _Sketches(NamedTuple):
     """A t-digest for each time and component, in the format of datasketches."""
 
     shape: tuple[int, ...]
-    digests: list[bytes]
+    sketches: list[bytes]
 
     @classmethod
-    def of(cls, x: np.ndarray) -> "_Digests":
+    def of(cls, x: np.ndarray) -> "_Sketches":
         made = []
         for values in x.reshape(len(x), -1).T:
             digest = _datasketches().tdigest_double(CENTROIDS)
@@ -192,19 +200,19 @@ class _Digests(NamedTuple):
             made.append(digest.serialize())
         return cls(x.shape[1:], made)
 
-    def merged(self, other: "_Digests") -> "_Digests":
+    def merged(self, other: "_Sketches") -> "_Sketches":
         merged = []
         for digest, later in zip(self._read(), other._read(), strict=True):
             digest.merge(later)
             merged.append(digest.serialize())
-        return _Digests(self.shape, merged)
+        return _Sketches(self.shape, merged)
 
     def quantile(self, p: float) -> np.ndarray:
         found = [np.nan if x.is_empty() else x.get_quantile(p) for x in self._read()]
         return np.reshape(found, self.shape)
 
     def _read(self) -> Iterator[Any]:
-        return map(_datasketches().tdigest_double.deserialize, self.digests)
+        return map(_datasketches().tdigest_double.deserialize, self.sketches)
 
 
 def _datasketches() -> Any:
@@ -221,11 +229,12 @@ class Summary(NamedTuple):
 
     Attributes:
         moments: count, mean, sum of squared deviations, and extremes.
+        sketches: t-digests for quantiles; None if these were not asked for.
         histogram: of the bins that were asked for; None if there are none.
     """
 
     moments: Moments
-    digests: _Digests | None
+    sketches: _Sketches | None
     histogram: Histogram | None
 
     @property
@@ -250,12 +259,12 @@ class Summary(NamedTuple):
 
     @property
     def min(self) -> Float[np.ndarray, "s ..."]:
-        """The smallest value."""
+        """The smallest value; NaN if there is none."""
         return self.moments.least
 
     @property
     def max(self) -> Float[np.ndarray, "s ..."]:
-        """The largest value."""
+        """The largest value; NaN if there is none."""
         return self.moments.greatest
 
     @property
@@ -265,7 +274,7 @@ class Summary(NamedTuple):
 
     @property
     def argmax(self) -> Int[np.ndarray, "s ..."]:
-        """Index of the trajectory of the largest value."""
+        """Index of the trajectory of the largest value, the first of equal ones; -1 if none."""
         return self.moments.at_greatest
 
     def quantile(self, p: Any) -> Float[np.ndarray, "s ..."]:
@@ -274,21 +283,22 @@ class Summary(NamedTuple):
         Raises:
             ValueError: quantiles were not asked for; p is not between 0 and 1.
         """
-        if self.digests is None:
+        if self.sketches is None:
             why = "they were not asked for"
             raise unsupported("`quantile`", why, "Give jl.Statistics(names, quantiles=True).")
-        if not 0.0 <= p <= 1.0:
-            raise invalid("p", "be between 0 and 1", f"it was {p!r}")
-        return self.digests.quantile(float(p))
+        is_number = isinstance(p, float | int | np.number) and not isinstance(p, bool)
+        if not is_number or not 0.0 <= p <= 1.0:
+            raise invalid("p", "be a number between 0 and 1", f"it was {p!r}")
+        return self.sketches.quantile(float(p))
 
     def merged(self, other: "Summary") -> "Summary":
         """Of both; `other` are later trajectories."""
-        digests, histogram = self.digests, self.histogram
-        if digests is not None and other.digests is not None:
-            digests = digests.merged(other.digests)
+        sketches, histogram = self.sketches, self.histogram
+        if sketches is not None and other.sketches is not None:
+            sketches = sketches.merged(other.sketches)
         if histogram is not None and other.histogram is not None:
             histogram = histogram.merged(other.histogram)
-        return Summary(self.moments.merged(other.moments), digests, histogram)
+        return Summary(self.moments.merged(other.moments), sketches, histogram)
 
 
 # ---- Of all names --------------------------------------------------------------------------------
@@ -361,6 +371,7 @@ class StatisticsResult(Mapping[str, Summary]):
         found = np.where(count == 0, np.nan, found)
         return found.reshape(len(found), *self._shapes[one], *self._shapes[other])
 
+    @_of_any_size
     def merged(self, other: "StatisticsResult") -> "StatisticsResult":
         """Of both; `other` are later trajectories."""
         summaries = {name: x.merged(other[name]) for name, x in self.items()}

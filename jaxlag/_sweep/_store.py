@@ -6,7 +6,6 @@ written in the same way, as the entry of the block in the array "checksum": a sw
 blocks whose entry does not fit their files.
 """
 
-import json
 import logging
 import os
 import shutil
@@ -27,10 +26,18 @@ from jaxlag._core._status import Status
 from jaxlag._sweep._files import remove_partial, write_whole
 from jaxlag._sweep._problem import differences
 from jaxlag._sweep._record import FACTS, NOT_COMPUTED, AbstractRecord, Layout, Rows
+from jaxlag._sweep._store_folder import (
+    CHECKSUM,
+    FORMAT,
+    beside,
+    bring_back,
+    check_alone,
+    described,
+    exists,
+    folder_at,
+    whole_files,
+)
 
-CHECKSUM = "checksum"
-FORMAT = 1
-"""Of the files."""
 PENDING = 2
 """Blocks that wait for the disk."""
 _INSTALL = 'pip install "jaxlag[sweep]"'
@@ -54,7 +61,7 @@ class Store(AbstractRecord):
     @property
     def checksum(self) -> str:
         """SHA-256 digest of those that the blocks have got; their files are not read."""
-        return sha256(_array(self.path, CHECKSUM)[:].tobytes()).hexdigest()
+        return sha256(self.read(CHECKSUM).tobytes()).hexdigest()
 
     def missing(self) -> list[int]:
         """Those without an entry that fits their files."""
@@ -81,26 +88,35 @@ class Store(AbstractRecord):
 
     @contextmanager
     def writer(self) -> Iterator[Callable[[int, Rows], None]]:
-        """By a thread, while the next block is computed."""
-        pending = deque[Future[None]]()
-        with ThreadPoolExecutor(1, "jaxlag-store") as thread:
+        """By a thread, while the next block is computed. After an error nothing more is written."""
+        pending, errors = deque[Future[None]](), list[BaseException]()
 
-            def write(block: int, rows: Rows) -> None:
-                pending.append(thread.submit(self._write, block, rows))
-                while len(pending) > PENDING:
-                    pending.popleft().result()
-
+        def attempt(block: int, rows: Rows) -> None:
             try:
+                if not errors:
+                    self._write(block, rows)
+            except BaseException as error:
+                errors.append(error)
+
+        def write(block: int, rows: Rows) -> None:
+            pending.append(thread.submit(attempt, block, rows))
+            while len(pending) > PENDING:
+                pending.popleft().result()
+            if errors:
+                raise errors[0]
+
+        try:
+            with ThreadPoolExecutor(1, "jaxlag-store") as thread:
                 yield write
-            finally:
-                while pending:
-                    pending.popleft().result()
+        finally:
+            if errors:
+                raise errors[0]
 
     def _write(self, block: int, rows: Rows) -> None:
         try:
             for name in (CHECKSUM, "status"):  # from here on the block is not computed
                 self._file(name, block).unlink(missing_ok=True)
-            digest = sha256()
+            digest = sha256(str(block).encode())
             for name, content in self._contents(block, rows):
                 write_whole(self._file(name, block), content)
                 digest.update(name.encode() + content)
@@ -126,12 +142,12 @@ class Store(AbstractRecord):
         return sorted(self.layout.arrays, key=lambda name: (name == "status", name))
 
     def _digest(self, block: int) -> bytes | None:
-        """Of the files of a block; None if one is missing."""
-        digest = sha256()
+        """Of the index and the files of a block; None if one cannot be read."""
+        digest = sha256(str(block).encode())
         for name in self._order:
             try:
                 digest.update(name.encode() + self._file(name, block).read_bytes())
-            except FileNotFoundError:
+            except OSError:
                 return None
         return digest.digest()
 
@@ -142,7 +158,9 @@ class Store(AbstractRecord):
 
     def read(self, name: str) -> np.ndarray:
         """Into memory."""
-        return np.asarray(_array(self.path, name)[:])
+        self._check_same()
+        with whole_files(self.path):
+            return np.asarray(_zarr().open_array(store=self.path / name, mode="r")[:])
 
     def rows(self, name: str, block: int) -> np.ndarray:
         """Into memory."""
@@ -158,14 +176,17 @@ class Store(AbstractRecord):
         except ImportError as error:
             why = f"{error.name} is not installed"
             raise unsupported("`to_xarray` of a store", why, _INSTALL) from error
+        self._check_same()
         return xarray.open_zarr(self.path, consolidated=False, drop_variables=CHECKSUM)
+
+    def _check_same(self) -> None:
+        """Raise if the folder has another sweep now."""
+        if different := differences(described(self.path)["problem"], self.problem):
+            must, was = "still hold this sweep", f"{self.path} was overwritten: {different}"
+            raise invalid("store", must, was)
 
     def __str__(self) -> str:
         return str(self.path)
-
-
-def _array(path: Path, name: str) -> Any:
-    return _zarr().open_array(store=path / name, mode="r")
 
 
 def _zarr() -> Any:
@@ -202,21 +223,23 @@ def created(path: Any, problem: Mapping[str, Any], layout: Layout, overwrite: bo
     Raises:
         ValueError: there is something else, or a store of another sweep, whose difference is named.
     """
-    folder = _folder(path)
+    folder = folder_at(path)
     _zarr()
     _check_names(layout)
-    different = differences(_described(folder)["problem"], problem) if _exists(folder) else ""
-    if different and not overwrite:
-        must, was = "hold trajectories of this sweep", f"{folder} differs in {different}"
-        raise invalid("store", must, was, "Choose another path, or give overwrite=True.")
-    new, old = (folder.with_name(f".{folder.name}.jaxlag-{x}") for x in ("new", "old"))
+    new, old = beside(folder)
     try:
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
+        bring_back(folder)
+        there = described(folder) if exists(folder) else None
+        different = differences(there["problem"], problem) if there else ""
+        if different and not overwrite:
+            must, was = "hold trajectories of this sweep", f"{folder} differs in {different}"
+            raise invalid("store", must, was, "Choose another path, or give overwrite=True.")
+        shutil.rmtree(new, ignore_errors=True)
         _write_empty(new, problem, layout)
         if different:
+            check_alone(folder)
             os.replace(folder, old)
-        if _exists(folder):
+        if exists(folder):
             _mend(folder, new)
         else:
             os.replace(new, folder)
@@ -224,6 +247,7 @@ def created(path: Any, problem: Mapping[str, Any], layout: Layout, overwrite: bo
         must, was = "be a folder that can be written", f"{folder} cannot: {error.strerror}"
         raise invalid("store", must, was) from error
     finally:
+        bring_back(folder)
         for left in (new, old):
             shutil.rmtree(left, ignore_errors=True)
     remove_partial(folder)
@@ -236,48 +260,27 @@ def opened(path: Any) -> Store:
     Raises:
         ValueError: there is none; a file of a trajectory that is computed is missing or cut.
     """
-    folder = _folder(path)
-    problem = _described(folder)["problem"]
-    group = _zarr().open_group(store=folder, mode="r")
-    ts, status = group["t"], group["status"]
-    known = [*problem["values"], *FACTS] + ([] if ts.ndim == 1 else ["t"])
-    found = {name: group[name] for name in known}
-    rows = {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in found.items()}
-    values = {name: rows.pop(name) for name in problem["values"]}
-    common = np.asarray(ts[:]) if ts.ndim == 1 else None
-    store = Store(folder, problem, Layout(status.shape[0], status.chunks[0], common, values, rows))
-    for block in range(store.layout.blocks):
-        if not store.is_whole(block):
-            must, was = "have whole files", f"those of block {block} in {folder} are not"
-            raise invalid("store", must, was, "The same jl.sweep computes the block again.")
+    folder = folder_at(path)
+    problem = described(folder)["problem"]
+    zarr = _zarr()
+    with whole_files(folder):
+        found = {
+            name: zarr.open_array(store=folder / name, mode="r")
+            for name in (*problem["values"], *FACTS, "t", CHECKSUM)
+        }
+        rows = {name: jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for name, x in found.items()}
+        (count, size), ts = (found["status"].shape[0], found["status"].chunks[0]), found["t"]
+        del rows[CHECKSUM]
+        common = None
+        if ts.ndim == 1:
+            common = np.fromfile(folder / "t" / "c" / "0", _on_disk(ts.dtype)).reshape(ts.shape)
+            del rows["t"]
+        values = {name: rows.pop(name) for name in problem["values"]}
+        store = Store(folder, problem, Layout(count, size, common, values, rows))
+        for block in range(store.layout.blocks):
+            if not store.is_whole(block):
+                raise ValueError(f"block {block}")
     return store
-
-
-def _folder(path: Any) -> Path:
-    text = str(path)
-    if not isinstance(path, str | os.PathLike) or not text or "://" in text or "\0" in text:
-        raise invalid("store", "be the path of a local folder", f"it was {path!r}")
-    folder = Path(path).expanduser().resolve()
-    if not folder.name:
-        raise invalid("store", "be the path of a local folder", f"it was {path!r}")
-    return folder
-
-
-def _exists(folder: Path) -> bool:
-    """Whether something is there but an empty folder."""
-    return folder.exists() and not (folder.is_dir() and not any(folder.iterdir()))
-
-
-def _described(folder: Path) -> Mapping[str, Any]:
-    """What a sweep wrote about itself; raises if there is none."""
-    try:
-        found = json.loads((folder / "zarr.json").read_text())["attributes"]["jaxlag"]
-        if found["format"] != FORMAT or not isinstance(found["problem"], dict):
-            raise ValueError(found)
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        must, was = f"be a store of jl.sweep of format {FORMAT}", f"{folder} is none"
-        raise invalid("store", must, was, "Check the path, or choose another one.") from error
-    return found
 
 
 def _mend(folder: Path, empty: Path) -> None:

@@ -58,7 +58,8 @@ def sweep(
         store: path of a folder, in which the trajectories are kept in place of the memory, block
             by block, as a group of zarr 3. A sweep that was ended at any moment goes on by the same
             call, and its files have the same bits then. One sweep at a time writes to a store.
-        overwrite: whether a store of another sweep there is replaced; one of this sweep goes on.
+        overwrite: whether a store of another sweep there is replaced, if nothing else is in its
+            folder; one of this sweep goes on. Results that were read from it raise then.
         statistics: names, or `Statistics`, whose results are `run.statistics`; they are computed
             while the sweep runs. With `keep=()` nothing else is kept of the trajectories than how
             they ended. In a store they are computed of what `keep` names.

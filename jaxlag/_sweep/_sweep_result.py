@@ -64,7 +64,7 @@ class AbstractSweep(eqx.Module):
         return self.record.read("t") if common is None else common
 
     @property
-    def values(self) -> Mapping[str, np.ndarray]:
+    def values(self) -> Mapping[str, Any]:
         """What was kept by name, each (n, s, *its shape)."""
         return Values(self.record)
 

@@ -80,6 +80,7 @@ def test_projection_of_dalembert_is_that_of_arrays(monkeypatch):
     np.testing.assert_allclose(*rates, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.full
 def test_wrong_projection_is_refused(monkeypatch):
     right = _derive_quasi.principle_of_dalembert
 

@@ -267,6 +267,7 @@ def test_forces_may_read_multipliers_of_quasi_velocities():
         jl.simulate(system, np.zeros(3), formulation="quasi", **start)
 
 
+@pytest.mark.full
 def test_kinematics_that_do_not_satisfy_a_row_use_multipliers():
     """Three speeds for three coordinates; the blade's row excludes one of them."""
 

@@ -200,6 +200,7 @@ cart = jl.System(
 )
 
 
+@pytest.mark.full
 def test_a_pid_controller_with_its_integrator():
     def field(t, y, p):
         x, v, integral = y

@@ -166,6 +166,8 @@ def test_moments_far_from_zero():
     np.testing.assert_array_equal(merged.at_least, np.nanargmin(whole, 0))
     nothing = Moments.of(0, np.full((5, 2), np.nan)).merged(Moments.of(5, np.full((1, 2), np.inf)))
     np.testing.assert_array_equal(nothing.at_greatest, -1)
+    large = jl.Statistics(("x",), covariance=True).of_block(0, {"x": np.full((5, 2), 1e200)})
+    np.testing.assert_array_equal(large.merged(large)["x"].max, 1e200)
     np.testing.assert_array_equal(nothing.least, np.nan)
 
 
@@ -184,6 +186,8 @@ def test_failed_trajectories_have_no_statistics_after_their_end():
         (("power push",), r"`statistics` must name some of .* but one was 'power push'"),
         ("x", "`names` must be a sequence of names"),
         ((), "`names` must name something"),
+        ((1,), "`names` must be a sequence of names, but one was 1"),
+        (("multipliers",), "`statistics` must name what the system has, but it has no 'multi"),
     ],
 )
 def test_bad_names_are_named(statistics, message):
@@ -208,8 +212,16 @@ def test_bad_requests_are_named(run):
         plain.statistics.covariance("x", "r")
     with pytest.raises(ValueError, match=r"`quantile` is not supported: they were not asked for"):
         plain.statistics["x"].quantile(0.5)
-    with pytest.raises(ValueError, match="`p` must be between 0 and 1, but it was 2"):
-        run.statistics["x"].quantile(2)
+    for p in (2, "0.5", None, [0.1, 0.5], True, np.array([0.1, 0.5])):
+        with pytest.raises(ValueError, match="`p` must be a number between 0 and 1, but it was"):
+            run.statistics["x"].quantile(p)
+    for histograms in (None, 5, [0.0, 1.0]):
+        with pytest.raises(ValueError, match="`histograms` must be edges by name, but it was"):
+            jl.Statistics(("x",), histograms=histograms)
+    edges = np.array([0.0, 1.0])
+    asked = jl.Statistics(("x",), histograms={"x": edges})
+    edges[1] = -1.0
+    np.testing.assert_array_equal(asked.histograms["x"], [0.0, 1.0])
     with pytest.raises(KeyError, match=r"must be one of \['x', 'r', 'energy', 'power drag'\]"):
         run.statistics["y"]
 

@@ -8,6 +8,7 @@ import pytest
 import jaxlag as jl
 from jaxlag import Status
 from jaxlag._sweep import _block
+from jaxlag._sweep._cases import cases_of
 from systems.catalogue import ENTRIES
 
 EPS = np.finfo(float).eps
@@ -143,6 +144,7 @@ def test_a_smaller_block_holds_long_records(monkeypatch):
     assert _block.block_size(10**9) == 64
 
 
+@pytest.mark.full
 def test_two_times_backwards(run):
     """Each further time of a replay is then the end of a solve of its own."""
     cases = stacked(run, range(3))
@@ -167,6 +169,7 @@ def test_failures_are_replayed(run):
 # ---- What cases consist of -----------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_dicts_tables_and_own_times():
     """A driven mass: starts by name, an input table and times for each trajectory."""
     system = jl.System(
@@ -264,6 +267,10 @@ SPREAD = jl.Case(np.zeros((3, 2)), np.zeros(2), {"l": np.ones(3)})
             "`cases.q0` must have a leading axis of 4, as n, but that was 3",
         ),
         ({"cases": jl.Case([0.0, 0.0]), "n": None}, "`cases` must have an array with a leading"),
+        (
+            {"cases": jl.Case(np.broadcast_to(1.0, (2,))), "n": None},
+            "must have an array",
+        ),
         ({"cases": jl.Case(np.zeros((3, 3)))}, r"q0` must have shape \(2,\) or \(n, 2\), but its"),
         ({"cases": jl.Case(np.zeros((3, 2)), ts=1.0)}, "ts` must be at least 2 times"),
         ({"cases": jl.Case(np.zeros((2, 2)), ts=np.ones((2, 3)))}, "ts` must be strictly monotone"),
@@ -307,6 +314,21 @@ def test_functions_that_cannot_be_drawn_from():
             swept(changing, 3)
 
 
+def test_cases_are_equal_if_their_programs_are():
+    """Also by constants of programs in the program, and by the seed's own place."""
+
+    def scaled(scale):
+        spread = jax.jit(lambda x: x * np.full(2, scale))
+        return lambda key, index: jl.Case(spread(jax.nn.relu(jnp.ones(2))), params={"l": 1.0})
+
+    one, same, other = (cases_of(DOUBLE, scaled(scale), 3, 0)[0] for scale in (1.0, 1.0, 0.5))
+    assert one == same
+    assert hash(one.static) == hash(same.static)
+    assert one != other
+    assert cases_of(DOUBLE, scaled(1.0), 3, 7)[0].form == one.form
+
+
+@pytest.mark.full
 def test_values_from_outside_are_those_of_the_sweep():
     """Also constants of programs in the program; a function written again has the same program."""
     outside = {"scale": 1.0}

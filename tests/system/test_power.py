@@ -222,6 +222,7 @@ def test_message_of_a_failed_motion_with_work_names_the_coordinate():
     np.testing.assert_array_equal(where, [0, -1])
 
 
+@pytest.mark.full
 def test_perturbation_growth_does_not_depend_on_work():
     """Work is not a perturbed variable; under jit the complete status is needed."""
 

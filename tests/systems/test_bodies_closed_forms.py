@@ -152,6 +152,7 @@ def test_the_tricycle_obeys_the_reduced_equations():
         close(u_rate, [v_rate, 0.0, 0.0, p["tau"] / p["I_steer"] - turn_rate], ROUNDING)
 
 
+@pytest.mark.full
 def test_the_printed_tricycle_obeys_its_own_equations():
     """With the steering torque m v^2 tan(phi), which the consistent tricycle does not have."""
     for _, q, _, p, u, u_rate in accelerations("tricycle_book_lagrangian"):

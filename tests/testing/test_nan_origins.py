@@ -191,6 +191,7 @@ def test_every_origin_is_named():
     assert [f.primitive for f in report.findings] == ["sqrt", "atan2"]
 
 
+@pytest.mark.full
 def test_hints_name_the_function_to_use():
     hints = {f.__name__: checked(f).findings[0].hint for f in NOT_FINITE}
     assert "jaxlag.math.norm" in hints["length"]
